@@ -103,7 +103,7 @@ def test_an_fmu_of_pythonfmus_own_is_repaired_where_it_is_loaded(fmu_path, tmp_p
         lambda self, fmu, folder: loaded.append((folder / LIBRARY).read_bytes()),
     )
     monkeypatch.setattr("twodof.fmu.instance.Instance.free", lambda self: None)
-    with twodof.fmu.instance.instantiate(twodof.load_fmu(other)):
+    with twodof.fmu.instantiate(twodof.load_fmu(other)):
         assert loaded == [repaired_wrapper(original())]
 
 

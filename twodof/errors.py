@@ -20,13 +20,22 @@ KINDS = {
     "bag": ("a bag", "twodof view"),
     "sweep": ("a sweep", "twodof plot"),
     "FMU": ("an FMU", "twodof run"),
+    "system": ("a system of FMUs", "twodof run"),
     "URDF": ("a robot description", "twodof build"),
     "page": ("a page", "xdg-open"),
     "CSV": ("a CSV file, for `changes` of a run", ""),
     "folder": ("a folder without a bag or a sweep", ""),
 }
 """Kinds of paths: the kind in words, and the command that accepts it."""
-SUFFIXES = {".fmu": "FMU", ".urdf": "URDF", ".xacro": "URDF", ".mcap": "bag", ".html": "page", ".csv": "CSV"}
+SUFFIXES = {
+    ".fmu": "FMU",
+    ".ssp": "system",
+    ".urdf": "URDF",
+    ".xacro": "URDF",
+    ".mcap": "bag",
+    ".html": "page",
+    ".csv": "CSV",
+}
 MAKERS = {"FMU": "twodof build", "bag": "twodof run", "sweep": "twodof sweep"}
 ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
 """Exceptions of a damaged, encrypted or foreign zip archive."""

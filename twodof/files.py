@@ -86,8 +86,8 @@ def shown(path: str | Path) -> str:
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
-def check_archive(path: str | Path) -> None:
-    """Refuse a zip archive that is unsafe to unzip, or has too many members to list.
+def check_archive(path: str | Path | bytes) -> None:
+    """Refuse a zip archive, a file or its content, that is unsafe to unzip, or has too many members to list.
 
     zipfile reads the whole list of members before it knows their number.
 
@@ -96,8 +96,9 @@ def check_archive(path: str | Path) -> None:
         UnsafeArchiveError: the archive is unsafe; the message says why.
         zipfile.BadZipFile: the archive is damaged.
     """
-    check_file(path, MAX_ARCHIVE)
-    with _Archive(path) as file, zipfile.ZipFile(file) as archive:
+    if not isinstance(path, bytes):
+        check_file(path, MAX_ARCHIVE)
+    with _Content(path) if isinstance(path, bytes) else _Archive(path) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
     files = set[str]()
     for member in members:
@@ -145,9 +146,20 @@ class _Archive(io.FileIO):
     """A zip archive that limits reads by the sizes in its list of members."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        if size is not None and size > MAX_DIRECTORY:
-            raise OSError(errno.EFBIG, "Too many members")
-        return super().read(size)
+        return super().read(_within_directory(size))
+
+
+class _Content(io.BytesIO):
+    """The content of such an archive."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(_within_directory(size))
+
+
+def _within_directory(size: int | None) -> int | None:
+    if size is not None and size > MAX_DIRECTORY:
+        raise OSError(errno.EFBIG, "Too many members")
+    return size
 
 
 def write_file(path: Path, content: bytes) -> None:

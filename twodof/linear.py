@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, SimulationError, choice
-from .fmu import Fmu, Instance, instantiate, load_fmu
+from .fmu import Fmu, Instance, System, instantiate, load_fmu
 from .notebook import card, picture
 from .simulation.input_values import Setting, Value, resolve
 from .simulation.setup import limits_of, robot_of
@@ -115,6 +115,8 @@ def linearise(
         SimulationError: there is no equilibrium near ``q_start``, or the plant has no linear model at the point.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
+    if isinstance(fmu, System):
+        raise InputError(f"'{fmu.path}' is a system, which has no derivatives; linearise the FMU of its plant")
     if not fmu.description.coSimulation.providesDirectionalDerivative or "der(q[1])" not in (fmu.variables):
         raise InputError(f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`")
     groups = ("der(q[{}])", "der(v[{}])", "q_start[{}]", "v_start[{}]", "q_min[{}]", "q_max[{}]")
@@ -128,6 +130,7 @@ def linearise(
     values |= resolve(fmu, {name: value for name, value in PERFECT.items() if fmu.vector(name)})
     period = {**fmu.start_values, **values}.get("control_period", 0.0)
     with instantiate(fmu) as instance:
+        assert isinstance(instance, Instance)
         point = _Point(fmu, instance, {**values, "control_period": 0.0} if period else values)
         if not fixed:
             point.settle()

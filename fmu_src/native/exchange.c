@@ -40,8 +40,11 @@ static Status update_discrete_states(void *component, Boolean *states_changed, d
     if (!settle(&draft.sampling, &draft.plant, draft.time))
         return refuse(instance, NEW_DISCRETE_STATES, NO_EFFORT);
     update_stops(&draft);
-    const int taken = take_passed_stop(&draft.passage, &draft.plant, &draft.stops, draft.time);
-    const int changed = handle_event(&draft.plant, &draft.stops) || taken;
+    int changed = 0;
+    if (!IS_CONTROLLER) {
+        changed = take_passed_stop(&draft.passage, &draft.plant, &draft.stops, draft.time);
+        changed |= handle_event(&draft.plant, &draft.stops);
+    }
     for (int i = 0; i < N_STATES; i++) /* the velocities of an impact may overflow */
         if (!isfinite(draft.plant.value[Q + i]))
             return report(instance, ERROR, "%s: %s would not be finite",
@@ -63,6 +66,8 @@ Status STANDARD(EnterContinuousTimeMode)(void *component)
     if (move_on(component, ENTER_CONTINUOUS_TIME_MODE, CONTINUOUS_TIME) != OK)
         return ERROR;
     State *state = &((Instance *)component)->state;
+    if (IS_CONTROLLER)
+        return OK;
     update_rates(state);
     begin_passage(&state->passage, &state->plant, state->time);
     return OK;
@@ -76,6 +81,9 @@ Status STANDARD(CompletedIntegratorStep)(void *component, Boolean no_set_state_p
     (void)no_set_state_prior;
     if (!instance)
         return ERROR;
+    *enter_event_mode = *terminate = 0;
+    if (IS_CONTROLLER)
+        return OK;
     const char *call = call_name(COMPLETED_INTEGRATOR_STEP);
     State *state = &instance->state;
     Passage *passage = &state->passage;
@@ -89,7 +97,6 @@ Status STANDARD(CompletedIntegratorStep)(void *component, Boolean no_set_state_p
         report(instance, WARNING, "%s: joint '%s' reversed at a limit in the solver's step to %.12g s, which"
                " the FMU cannot integrate: %s", call, JOINT_NAME[failed - 1], state->time, remedy);
     *enter_event_mode = passage->joint != 0;
-    *terminate = 0;
     return OK;
 }
 
@@ -107,44 +114,45 @@ Status STANDARD(SetTime)(void *component, double time)
 
 Status STANDARD(SetContinuousStates)(void *component, const double x[], size_t count)
 {
-    Instance *instance = enter_with(component, SET_CONTINUOUS_STATES, x, count, N_STATES);
+    Instance *instance = enter_with(component, SET_CONTINUOUS_STATES, x, count, N_CONTINUOUS);
     if (!instance)
         return ERROR;
     State *state = &instance->state;
-    for (int i = 0; i < N_STATES; i++)
+    for (int i = 0; i < N_CONTINUOUS; i++)
         if (!isfinite(x[i]))
             return report(instance, ERROR, "%s: %s is not finite",
                           call_name(SET_CONTINUOUS_STATES), VARIABLE_NAME[Q + i]);
     update_stops(state); /* joints at rest stay at rest until an event */
-    memcpy(&state->plant.value[Q], x, N_STATES * sizeof *x);
+    memcpy(&state->plant.value[Q], x, N_CONTINUOUS * sizeof *x);
     state->has_x = state->has_tau = state->has_rates = 0;
     return OK;
 }
 
 Status STANDARD(GetDerivatives)(void *component, double derivatives[], size_t count)
 {
-    Instance *instance = enter_with(component, GET_DERIVATIVES, derivatives, count, N_STATES);
+    Instance *instance = enter_with(component, GET_DERIVATIVES, derivatives, count, N_CONTINUOUS);
     if (!instance)
         return ERROR;
     const double *rate = &instance->state.plant.value[DER_Q];
     update_rates(&instance->state);
-    for (int i = 0; i < N_STATES; i++)
+    for (int i = 0; i < N_CONTINUOUS; i++)
         if (!isfinite(rate[i]))
             return report(instance, DISCARD, "%s: %s is not finite",
                           call_name(GET_DERIVATIVES), VARIABLE_NAME[DER_Q + i]);
-    memcpy(derivatives, rate, N_STATES * sizeof *rate);
+    memcpy(derivatives, rate, N_CONTINUOUS * sizeof *rate);
     return OK;
 }
 
 Status STANDARD(GetEventIndicators)(void *component, double indicators[], size_t count)
 {
     Instance *instance =
-        enter_with(component, GET_EVENT_INDICATORS, indicators, count, N_INDICATORS);
+        enter_with(component, GET_EVENT_INDICATORS, indicators, count, N_EVENTS);
     if (!instance)
         return ERROR;
     update_stops(&instance->state);
-    event_indicators(&instance->state.plant, &instance->state.stops, indicators);
-    for (int i = 0; i < N_INDICATORS; i++)
+    if (N_EVENTS > 0)
+        event_indicators(&instance->state.plant, &instance->state.stops, indicators);
+    for (int i = 0; i < N_EVENTS; i++)
         if (!isfinite(indicators[i]))
             return report(instance, DISCARD, "%s: the %d. is not finite",
                           call_name(GET_EVENT_INDICATORS), i + 1);
@@ -153,19 +161,19 @@ Status STANDARD(GetEventIndicators)(void *component, double indicators[], size_t
 
 Status STANDARD(GetContinuousStates)(void *component, double x[], size_t count)
 {
-    Instance *instance = enter_with(component, GET_CONTINUOUS_STATES, x, count, N_STATES);
+    Instance *instance = enter_with(component, GET_CONTINUOUS_STATES, x, count, N_CONTINUOUS);
     if (!instance)
         return ERROR;
-    memcpy(x, &instance->state.plant.value[Q], N_STATES * sizeof *x);
+    memcpy(x, &instance->state.plant.value[Q], N_CONTINUOUS * sizeof *x);
     return OK;
 }
 
 Status STANDARD(GetNominalsOfContinuousStates)(void *component, double nominals[], size_t count)
 {
-    Instance *instance = enter_with(component, GET_NOMINALS, nominals, count, N_STATES);
+    Instance *instance = enter_with(component, GET_NOMINALS, nominals, count, N_CONTINUOUS);
     if (!instance)
         return ERROR;
-    for (int i = 0; i < N_STATES; i++)
+    for (int i = 0; i < N_CONTINUOUS; i++)
         nominals[i] = 1.0;
     return OK;
 }

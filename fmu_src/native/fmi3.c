@@ -150,12 +150,12 @@ static fmi3Status tell(fmi3Instance instance, size_t size, size_t *count)
 
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *count)
 {
-    return tell(instance, N_INDICATORS, count);
+    return tell(instance, N_EVENTS, count);
 }
 
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *count)
 {
-    return tell(instance, N_STATES, count);
+    return tell(instance, N_CONTINUOUS, count);
 }
 
 /* Functions of features that modelDescription.xml excludes: clocks, structural parameters, event mode in

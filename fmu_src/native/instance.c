@@ -115,7 +115,7 @@ static Status initialise(Instance *instance, int warn)
     const int anti_chatter[N_JOINTS] = {0};
     if (check_parameters(instance) != OK || check_inputs(instance) != OK)
         return ERROR;
-    for (int i = 0; i < N_JOINTS; i++) {
+    for (int i = 0; i < N_JOINTS && !IS_CONTROLLER; i++) {
         const double start = value[Q_START + i];
         const double low = value[Q_MIN + i], high = value[Q_MAX + i];
         const double q = start < low ? low : start > high ? high : start;
@@ -126,7 +126,8 @@ static Status initialise(Instance *instance, int warn)
         value[Q + i] = q;
         value[V + i] = value[V_START + i];
     }
-    impact(&state->plant, &value[Q], anti_chatter);
+    if (!IS_CONTROLLER)
+        impact(&state->plant, &value[Q], anti_chatter);
     state->sampling = (Sampling){.start = state->time, .time = state->time};
     for (int i = 0; i < N_JOINTS && value[CONTROL_PERIOD] != 0.0; i++)
         value[TAU + i] = 0.0;

@@ -13,6 +13,9 @@ typedef struct {
 
 enum { N_STATES = 2 * N_JOINTS }; /* q and v are adjacent in the table, and so are their derivatives */
 
+/* States of Model Exchange, and its event indicators, which a controller alone does not have. */
+enum { N_CONTINUOUS = IS_CONTROLLER ? 0 : N_STATES, N_EVENTS = IS_CONTROLLER ? 0 : N_INDICATORS };
+
 /* q̈ by the equations of motion at a state, with the given rank of J⁺. Joints slip in the given directions (−1, 1; 0 or
    NULL: no friction), and joints at rest are free. Returns the rank. The margin, which may be NULL, is negative if the
    singular values give another rank. */

@@ -77,7 +77,8 @@ static Status take_over(Instance *instance, const void *bytes)
                 && are_stops(&state->stops) && is_passage(&state->passage);
     const int runs = state->phase >= STEP; /* before the run, initialisation reports errors */
     sound = sound && (!runs || is_sampling(&state->sampling, &state->plant, state->time));
-    const int steps = runs && instance->kind == CO_SIMULATION; /* a solver may try any state in Model Exchange */
+    /* a solver may try any state in Model Exchange */
+    const int steps = runs && instance->kind == CO_SIMULATION && !IS_CONTROLLER;
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));
     for (int i = 0; i < N_JOINTS && steps; i++)

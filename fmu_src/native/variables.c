@@ -50,7 +50,7 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
 
 static int is_state(int variable)
 {
-    return variable >= Q && variable < X;
+    return !IS_CONTROLLER && variable >= Q && variable < X;
 }
 
 /* True if a variable may be set now. */
@@ -86,8 +86,8 @@ static void set(Instance *instance, int variable, double value)
     state->has_tau = state->has_rates = 0;
     if (is_state(variable))
         state->has_x = 0;
-    if (is_state(variable) || instance->kind == CO_SIMULATION) /* in co-simulation, each communication point finds the
-    joints at rest */
+    /* in co-simulation, each communication point finds the joints at rest */
+    if (is_state(variable) || instance->kind == CO_SIMULATION || IS_CONTROLLER)
         state->has_stops = 0;
     if (variable >= FIRST_PARAMETER)
         state->initialised = 0;

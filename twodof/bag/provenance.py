@@ -12,6 +12,7 @@ from urllib.parse import quote, unquote
 from ..bounds import MAX_HELD, MAX_PROVENANCE
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
+from ..fmu import System
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Changes, Value
 from ..version import versions
@@ -49,8 +50,8 @@ SHAPE = {
 class Provenance(TypedDict, total=False):
     """Content of run.json; empty for a third-party bag.
 
-    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` has pairs of a time and facts of a
-    third party. ``verdict`` is missing if the writer died.
+    ``system`` has the FMUs of a system and their connections. ``input_changes`` has pairs of a time, s, and values by
+    name; ``commanders`` has pairs of a time and facts of a third party. ``verdict`` is missing if the writer died.
     """
 
     format: int
@@ -66,6 +67,7 @@ class Provenance(TypedDict, total=False):
     versions: dict[str, str]
     command_line: str
     urdf: str | None
+    system: dict[str, Any]
     input_changes: list[list[Any]]
     inputs_known_until: float
     commanders: list[object]
@@ -152,7 +154,14 @@ def provenance_of(run: Experiment, command_line: str) -> Provenance:
         "versions": versions(*PACKAGES),
         "command_line": command_line,
         "urdf": fmu.urdf,
+        **(_system(fmu) if isinstance(fmu, System) else {}),
     }
+
+
+def _system(system: System) -> Provenance:
+    """Return the FMUs of a system and their connections."""
+    fmus = {name: {"name": fmu.name, "guid": fmu.guid} for name, fmu in system.components.items()}
+    return {"system": {"components": fmus, "connections": system.connections}}
 
 
 def file_of(namespace: str) -> str:

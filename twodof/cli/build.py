@@ -51,6 +51,12 @@ def add(build: argparse.ArgumentParser) -> None:
         default="task",
         help="control law: target of the frame, target of each joint, or efforts (%(default)s)",
     )
+    option(
+        "--part",
+        choices=("all", "controller"),
+        default="all",
+        help="robot under its control law, or the control law alone, as a native FMU (%(default)s)",
+    )
     flag("--orientation", help="control the frame's orientation beside its position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
@@ -96,9 +102,9 @@ def call(options: argparse.Namespace) -> int:
         path = _build(options)
     if not path.is_file():  # a pipe, from which nothing is read back
         return 0
-    from ..fmu import load_fmu
+    from ..fmu import load_any_fmu
 
-    fmu = load_fmu(path)
+    fmu = load_any_fmu(path)
     print_table(
         ("FMU", f"{path} ({path.stat().st_size / 1024:.0f} KB, {', '.join(fmu.platforms)})"),
         ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
@@ -107,6 +113,8 @@ def call(options: argparse.Namespace) -> int:
     if path.suffix != ".fmu":
         say("note: most FMI tools open only files whose name ends in .fmu", error=True)
     here = fmu.platform in fmu.platforms
+    if options.part == "controller":
+        return 0
     print_next(f"twodof run {quote(path)}" if here else "twodof build --native", f"twodof info {quote(path)}")
     return 0
 
@@ -133,7 +141,7 @@ def _build(options: argparse.Namespace) -> Path:
         settings=parse_settings(options.settings),
         arrays=not options.scalars,
         platforms=tuple(dict.fromkeys(platforms)),
-        **given_options(options, "axes", "link_environment", "native", "fmi", "reference"),
+        **given_options(options, "axes", "link_environment", "native", "fmi", "reference", "part"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     return build_fmu(options.output, chosen, overwrite=options.overwrite)

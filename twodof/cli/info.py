@@ -1,4 +1,4 @@
-"""Verb info: show the contents of an FMU, a bag or a sweep."""
+"""Verb info: show the contents of an FMU, a system of FMUs, a bag or a sweep."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from ..bag.recording import Recording
-    from ..fmu import Fmu
+    from ..fmu import Fmu, System
     from ..simulation.expressions import Expression
     from ..simulation.verdict import Verdict
 
@@ -27,8 +27,8 @@ MOST_JUDGED = 200_000  # samples of a bag without a stored verdict, which takes 
 
 def add(info: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path, help="FMU, bag or sweep to describe")
-    add_options(info, "--cost", "--json")
+    info.add_argument("path", metavar="FMU|SSP|BAG|SWEEP", type=Path, help="FMU, system, bag or sweep to describe")
+    add_options(info, "--robot", "--cost", "--json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -53,7 +53,7 @@ def call(options: argparse.Namespace) -> int:
     else:
         from ..fmu import load_fmu
 
-        (_print_fmu_json if options.json else _print_fmu)(load_fmu(path))
+        (_print_fmu_json if options.json else _print_fmu)(load_fmu(path, options.robot))
     return 0
 
 
@@ -75,8 +75,11 @@ def _show_bags(path: Path, as_json: bool) -> None:
 
 
 def _print_fmu_json(fmu: Fmu) -> None:
+    from ..fmu import System
+
     print_json(
-        kind="FMU",
+        kind="system" if isinstance(fmu, System) else "FMU",
+        **(dict(components=[*fmu.components], connections=fmu.connections) if isinstance(fmu, System) else {}),
         path=str(fmu.path),
         name=fmu.name,
         guid=fmu.guid,
@@ -142,6 +145,25 @@ def _print_sweep(path: Path, table: DataFrame, cost: Expression | None) -> None:
 
 
 def _print_fmu(fmu: Fmu) -> None:
+    from ..fmu import System
+
+    if isinstance(fmu, System):
+        _print_system(fmu)
+    else:
+        _print_head(fmu)
+    rows = [("variable", "unit", "start", "")]
+    for causality in ("input", "output", "parameter"):
+        for group, names in fmu.groups(causality).items():
+            variables = [fmu.variables[name] for name in names]
+            size = "" if names == [group] else f"[{len(names)}]"
+            starts = ", ".join(_start(v.start) for v in variables if v.start is not None)
+            units = ", ".join(dict.fromkeys(variable.unit or "" for variable in variables))
+            rows.append((f"{group}{size}", units, starts, causality))
+    say()
+    print_table(*rows)
+
+
+def _print_head(fmu: Fmu) -> None:
     simulation = fmu.description.coSimulation
     capabilities = [
         name
@@ -154,9 +176,8 @@ def _print_fmu(fmu: Fmu) -> None:
         )
         if getattr(simulation, name)
     ]
-    origin = ", ".join(filter(None, (fmu.name, fmu.description.generationTool)))
     print_table(
-        ("FMU", f"{fmu.path} ({origin})"),
+        ("FMU", f"{fmu.path} ({_origin(fmu)})"),
         ("FMI", fmu.description.fmiVersion),
         ("digest", fmu.guid),
         ("platforms", ", ".join(fmu.platforms) or "none"),
@@ -165,16 +186,21 @@ def _print_fmu(fmu: Fmu) -> None:
         ("joints", ", ".join(fmu.joints)),
         ("controlled", controlled(fmu)),
     )
-    rows = [("variable", "unit", "start", "")]
-    for causality in ("input", "output", "parameter"):
-        for group, names in fmu.groups(causality).items():
-            variables = [fmu.variables[name] for name in names]
-            size = "" if names == [group] else f"[{len(names)}]"
-            starts = ", ".join(_start(v.start) for v in variables if v.start is not None)
-            units = ", ".join(dict.fromkeys(variable.unit or "" for variable in variables))
-            rows.append((f"{group}{size}", units, starts, causality))
-    say()
-    print_table(*rows)
+
+
+def _print_system(system: System) -> None:
+    robot, parts = system.prefix.removesuffix("."), system.components.items()
+    print_table(
+        ("system", f"{system.path} ({system.name})"),
+        ("digest", system.guid),
+        ("robot", f"{robot}: {', '.join(system.joints)}"),
+        *(("" if i else "FMUs", f"{name}: {_origin(fmu)}, FMI {fmu.version}.0") for i, (name, fmu) in enumerate(parts)),
+        *(("" if i else "connections", text) for i, text in enumerate(system.connections or ["none"])),
+    )
+
+
+def _origin(fmu: Fmu) -> str:
+    return ", ".join(filter(None, (fmu.name, fmu.description.generationTool)))
 
 
 def controlled(fmu: Fmu) -> str:

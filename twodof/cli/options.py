@@ -67,6 +67,7 @@ OF_A_PAGE: Table = {
 OPTIONS: Table = {
     "--cost": dict(metavar="EXPRESSION", help="cost of metrics that ranks the runs, as 'settling + 0.1*peak_effort'"),
     "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)"),
+    "--robot": dict(default="", metavar="NAME", help="component of a system whose q and v are the robot's"),
     "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's default)"),
     "--namespace": dict(default="", metavar="NS", help="namespace of the topics"),

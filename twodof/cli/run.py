@@ -31,8 +31,8 @@ def add(run: argparse.ArgumentParser) -> None:
     add_options(run, "--stop-time", "--step")
     run.add_argument("--measured", action="store_true", help="record joint states as measured, beside the true ones")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
-    add_fmu(run, "TwoDof.fmu, built if need be")
-    add_options(run, "--frame", *OF_A_RUN)
+    add_fmu(run, "TwoDof.fmu, built if need be", "FMU|SSP|URDF")
+    add_options(run, "--robot", "--frame", *OF_A_RUN)
     run.add_argument(
         "--fail-if",
         action="append",
@@ -78,7 +78,7 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
     from ..simulation.experiments import experiment
 
     settings = parse_settings(options.settings)
-    fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
+    fmu, table, changes = load_fmu(chosen_fmu(options), getattr(options, "robot", "")), options.input, None
     if table is not None:
         folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
         if Path(folder).is_dir() and folder:

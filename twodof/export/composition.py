@@ -12,7 +12,7 @@ from ..files import data_file
 from ..plant.plant import ParameterError, Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import read_urdf
-from ..plant.variables import CONTROLS, Starts, Value, Variable, variable_table
+from ..plant.variables import CONTROLS, Starts, Value, Variable, controller_table, variable_table
 from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
@@ -53,15 +53,18 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     text = read_text(path, mesh_dir)
     text = lock_joints(text, options.lock) if options.lock else text
     options = replace(options, frame=end_effector(read_urdf(text), options.frame))
-    if not options.meshes:
+    if not options.meshes or options.part == "controller":
         text = without_meshes(text)
     robot, table, starts = _model(options, text)
+    if options.part == "controller":
+        table = controller_table(table)
     urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
     flavour = _flavour(options, robot, table, urdf, starts)
     resources = {"robot.urdf": urdf.encode(), **meshes}
     files = {f"resources/{name}": content for name, content in resources.items()}
     files.update(flavour.files)
     variables = engine_variables(robot, table, options.control, flavour.fmi)
+    shown = [variable for variable in table if variable.shown]
 
     digest = hashlib.sha256(model_description(options, robot, variables, flavour, ""))
     for name in sorted(files):
@@ -73,7 +76,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
 
     def finish() -> Files:
         """Return the files that the GUID does not cover: binaries, documentation and references."""
-        described = documentation(options, robot, table, flavour, guid, urdf)
+        described = documentation(options, robot, shown, flavour, guid, urdf)
         extra = references(robot, table, options.control) if options.reference else {}
         return {**flavour.signed(guid), **described, **extra}
 
@@ -156,6 +159,7 @@ class _Variables(NamedTuple):
 
     variables: Mapping[str, Variable]
     control: str
+    prefix: str = ""
 
 
 def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:

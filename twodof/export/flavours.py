@@ -129,7 +129,7 @@ def native_flavour(
     files["sources/model.h"] = header("")
     if fmi == 3:
         files["sources/buildDescription.xml"] = build_description(name, UNITS)
-        files["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table, arrays)
+        files["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons([v for v in table if v.shown], arrays)
     return Flavour(native=True, files=files, platforms=platforms, signed=signed, fmi=fmi, arrays=arrays)
 
 

@@ -30,6 +30,7 @@ class FmuOptions:
         settings: start values of variables by name, as in ``experiment``.
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".
+        part: "all", or "controller": the control law alone, with inputs q and v and outputs tau_cmd; native.
         name: model name and identifier; "": name of the URDF's file, "TwoDof" for the shipped arm.
         link_environment: store the folders of this Python's packages in the FMU; not for the native
             flavour, which needs no Python.
@@ -52,6 +53,7 @@ class FmuOptions:
     q_start: tuple[float, ...] | Mapping[str, float] | None = None
     control: str = "task"
     settings: Mapping[str, object] = field(default_factory=dict)
+    part: str = "all"
     name: str = ""
     link_environment: bool = False
     native: bool = False
@@ -71,11 +73,17 @@ class FmuOptions:
                 raise BuildError(f"`{name}` is the number {value:g}; give all its elements, in a tuple")
         if not isinstance(self.lock, Mapping):
             raise BuildError(f"`lock` is {self.lock!r:.50}; give positions by joint, as {{'joint1': 0.0}}")
+        if self.part not in ("all", "controller"):
+            raise BuildError(f"`part` '{self.part}' is unknown; it is 'all' or 'controller'")
+        if self.part == "controller" and self.reference:
+            raise BuildError("reference trajectories are of the robot under its control law; leave out `reference`")
+        if self.part == "controller" and (not self.native or self.control == "effort"):
+            raise BuildError("the controller alone is native, `native=True`, and has a control law other than 'effort'")
 
     @property
     def is_default_arm(self) -> bool:
         """True for the shipped arm with its default settings, in any flavour."""
-        model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "settings", "name")
+        model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "settings", "part", "name")
         return all(getattr(self, key) == getattr(FmuOptions(), key) for key in model)
 
 

@@ -68,13 +68,18 @@ def model_description(
     fmi, law = flavour.fmi, CONTROLS[options.control]
     names = [replace(v, index=None).name if flavour.arrays else v.name for v in table]
     reference = {name: str(i) for i, name in enumerate(dict.fromkeys(names), start=1)}
+    table, names = [v for v in table if v.shown], [name for name, v in zip(names, table) if v.shown]
     references = [reference[name] for name in names]
+    place = reference if fmi == 3 else {name: str(i) for i, name in enumerate(names, start=1)}
+    places = [place[name] for name in names]
     attributes = {
         "fmiVersion": f"{fmi}.0",
         "modelName": options.name,
         "guid" if fmi == 2 else "instantiationToken": guid,
-        "description": f"Robot '{robot.name}' with {len(robot.joints)} joints under"
-        f" {law.title.format(frame=robot.frame)}",
+        "description": ("Controller of robot" if options.part == "controller" else "Robot")
+        + f" '{robot.name}' with {len(robot.joints)} joints"
+        + (": " if options.part == "controller" else " under ")
+        + law.title.format(frame=robot.frame),
         "version": __version__,
         "author": AUTHOR,
         "copyright": f"Copyright (c) {AUTHOR}; of the robot's description, its author's",
@@ -83,7 +88,8 @@ def model_description(
         "variableNamingConvention": "structured",
     }
     if flavour.native and fmi == 2:
-        attributes["numberOfEventIndicators"] = str(count_event_indicators(robot, options.control))
+        indicators = 0 if options.part == "controller" else count_event_indicators(robot, options.control)
+        attributes["numberOfEventIndicators"] = str(indicators)
     root = ET.Element("fmiModelDescription", attributes)
     _interfaces(root, options.name, flavour)
     add_units(root, {variable.unit for variable in table}, fmi)
@@ -95,7 +101,7 @@ def model_description(
         annotations = ET.SubElement(root, "VendorAnnotations")
         _describe(ET.SubElement(annotations, "Tool", name=VENDOR), robot, options.control)
     _variables(root, robot, table, names, references, flavour)
-    _structure(root, robot, table, references, law, fmi)
+    _structure(root, robot, table, places, law, fmi)
     if fmi == 3:
         annotations = ET.SubElement(root, "Annotations")
         _describe(ET.SubElement(annotations, "Annotation", type=VENDOR), robot, options.control)
@@ -173,7 +179,7 @@ def _variables(
         first, elements = table[indices[0]], []
         for i in indices:
             group, index, start = table[i].group, table[i].index, table[i].start
-            if group in STATES:
+            if group in STATES and table[i].causality == "output":
                 start = table[row_of[f"{group}_start", index]].start
             attributes = _attributes(robot, table[i], start, flavour.native)
             elements.append({"valueReference": str(i), **attributes})
@@ -201,7 +207,7 @@ def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges
         "causality": variable.causality,
         "variability": "fixed" if variable.causality == "parameter" else "continuous",
     }
-    state = variable.group in STATES
+    state = variable.group in STATES and variable.causality == "output"
     if variable.causality in ("output", "local"):
         attributes["initial"] = "approx" if state else "calculated"
     elif variable.causality == "parameter":
@@ -262,9 +268,9 @@ def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, 
         "x": (START, FRAME),
         "quat": (START, FRAME),
         **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, EVERY)),
-        "tau": ((*IMPACT, *law, *control.inputs), EVERY),
-        "q_meas": ((*START, "q_resolution", "q_noise", "seed"), OWN),
-        "v_meas": (IMPACT, EVERY, ("v_noise", "seed", "v_from_q")),
+        "tau": ((*IMPACT, *law, *control.inputs, *STATES), EVERY),
+        "q_meas": ((*START, "q", "q_resolution", "q_noise", "seed"), OWN),
+        "v_meas": (IMPACT, EVERY, ("v", "v_noise", "seed", "v_from_q")),
         "der_v": ((*IMPACT, "friction", "damping", *law, "control_period", *inputs), EVERY),
     }
     if control.commands == "effort":
@@ -291,13 +297,15 @@ def _structure(
 
     unknowns: dict[str, dict[str, dict[str, None]]] = {part: {} for part in UNKNOWNS_3}
     for variable, reference in zip(table, references):
-        if variable.group in during:
+        if variable.group in during and variable.causality != "input":
             kind = "Outputs" if variable.causality == "output" else "Derivatives"
             for part, rule in ((kind, during), ("InitialUnknowns", at_the_start)):
                 dependencies = known(variable, *rule[variable.group])
                 unknowns[part].setdefault(reference, {}).update(dependencies)
     structure = ET.SubElement(root, "ModelStructure")
     for part, name in UNKNOWNS_3.items():
+        if not unknowns[part]:
+            continue
         parent = ET.SubElement(structure, part) if fmi == 2 else structure
         tag, key = ("Unknown", "index") if fmi == 2 else (name, "valueReference")
         for reference, dependencies in unknowns[part].items():

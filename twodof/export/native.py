@@ -4,7 +4,7 @@ The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``mo
 dynamics are ``mechanism.c``. Pinocchio has read the URDF.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -29,6 +29,7 @@ def model_header(
     m = len(robot.axes)
     table = engine_variables(robot, table, control, fmi)
     groups = [variable.group for variable in table]
+    is_controller = table[groups.index("q")].causality == "input"
     sections = [
         "/* Constants of a robot, generated from its URDF. SI units. */\n"
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
@@ -39,8 +40,9 @@ def model_header(
         f"#define BUDGET {BUDGET} /* evaluations of the equations of motion in one communication step, at most */\n"
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
+        f"#define IS_CONTROLLER {int(is_controller)} /* the control law alone: q and v are inputs */\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
-        _groups(groups),
+        _groups(groups, {**FIRST, "FIRST_OUTPUT": "x"} if is_controller else FIRST),
         _references(table, fmi == 3 and arrays),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
@@ -60,15 +62,16 @@ def engine_variables(robot: Robot, table: Sequence[Variable], control: str, fmi:
         return table
     first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
     count = count_event_indicators(robot, control)
-    indicators = [Variable(INDICATORS, i, "local", "", None, SIGNS) for i in range(count)]
+    shown = all(variable.shown for variable in table)
+    indicators = [Variable(INDICATORS, i, "local", "", None, SIGNS, shown=shown) for i in range(count)]
     time = Variable("time", None, "independent", "s", None, "time")
     return [*table[:first], *indicators, time, *table[first:]]
 
 
-def _groups(groups: Sequence[str]) -> str:
+def _groups(groups: Sequence[str], first: Mapping[str, str]) -> str:
     lines = [f"    {group.upper()} = {groups.index(group)}," for group in dict.fromkeys(groups)]
     lines.append(f"    N_VARIABLES = {len(groups)},")
-    lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
+    lines += [f"    {constant} = {group.upper()}," for constant, group in first.items()]
     body = "\n".join(lines)
     return f"/* Places of variables: the first of each vector. */\nenum {{\n{body}\n}};\n"
 

@@ -71,7 +71,12 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
 
 def is_fmu(path: Path) -> bool:
     """Return whether a file is a zip archive with a model description."""
-    return _fits(path, lambda zipped: "modelDescription.xml" in zipped.namelist())
+    return has_member(path, "modelDescription.xml")
+
+
+def has_member(path: Path, name: str) -> bool:
+    """Return whether a file is a sound zip archive with such a member."""
+    return _fits(path, lambda zipped: name in zipped.namelist())
 
 
 def is_default_arm(path: Path) -> bool:

@@ -37,6 +37,10 @@ class Variables(Protocol):
     def control(self) -> str:
         """The control law; "" if unknown."""
 
+    @property
+    def prefix(self) -> str:
+        """Prefix that names may have, "" for none."""
+
 
 def vector(variables: Mapping[str, Settable], group: str) -> list[str]:
     """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
@@ -65,6 +69,8 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
         raise InputError(f"settings are values by name, as {{'Kp': 80}}, not {settings!r:.50}")
     values: dict[str, Value] = {}
     for name, setting in settings.items():
+        if not vector(fmu.variables, name):
+            name = name.removeprefix(fmu.prefix)
         elements = [name] if name in fmu.variables else vector(fmu.variables, name)
         if not elements:
             raise InputError(no_variable(fmu, name, "input", "parameter"))

@@ -6,15 +6,20 @@ with redirect_stdout(None):  # FMPy prints on aarch64-linux that it has no logge
     import fmpy  # noqa: F401
 
 from ..export.start_values import Setting, no_variable, resolve
-from .description import Fmu, load_fmu, opened, read_resource
-from .instance import Instance, Values, instantiate
+from .description import Fmu, load_any_fmu, opened, read_resource
+from .instance import Instance, Values
+from .system import System, load_fmu
+from .system_instance import SystemInstance, instantiate
 
 __all__ = [
     "Fmu",
     "Instance",
     "Setting",
+    "System",
+    "SystemInstance",
     "Values",
     "instantiate",
+    "load_any_fmu",
     "load_fmu",
     "no_variable",
     "opened",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -16,18 +16,16 @@ from xml.etree import ElementTree as ET
 import fmpy
 from fmpy.model_description import ModelDescription, ModelVariable, ValidationError
 
-from ..bounds import MAX_DESCRIPTION, MAX_RESOURCE
-from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
+from ..bounds import MAX_RESOURCE
+from ..errors import ZIP_ERRORS, FmuError
 from ..export.compiler import host_platform
 from ..export.icon import side_view
 from ..export.start_values import groups_of, vector
-from ..files import UnsafeArchiveError, check_archive, read_member, shown
+from ..files import read_member, shown
 from ..notebook import card, picture
 from ..plant.urdf import RobotError, read_urdf
-from .validation import is_plain_xml, read_description
-
-NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": ("true", "1").__contains__}
-"""Supported types of variables, and functions that parse their start values."""
+from .archives import checksums, open_archive, read_archive
+from .validation import NUMBERS, read_description
 
 
 @dataclass(frozen=True)
@@ -75,6 +73,9 @@ class Fmu:
         frame, root, axes: the task frame, the frame in which its position is expressed, and the task
             axes; "" if unknown.
         control: name of the control law, e.g. "task"; "" if unknown.
+        described: size of its description, bytes.
+        inside: name of the FMU's file in the system at ``path``; "" if ``path`` is the FMU.
+        prefix: optional prefix of its variables in settings, e.g. "plant." in a system; "" if none.
     """
 
     path: Path
@@ -88,6 +89,9 @@ class Fmu:
     root: str
     axes: str
     control: str
+    described: int = 0
+    inside: str = ""
+    prefix: str = ""
 
     def __repr__(self) -> str:
         return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"
@@ -141,7 +145,7 @@ class Fmu:
 
     def vector(self, group: str) -> list[str]:
         """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
-        return vector(self.variables, group)
+        return vector(self.variables, group if group in self.variables else group.removeprefix(self.prefix))
 
     def groups(self, causality: str) -> dict[str, list[str]]:
         """Return vectors and scalars of one causality by group name."""
@@ -163,43 +167,27 @@ def _pose(fmu: Fmu) -> str:
     return picture((line.T for line in lines), *(f"{axis} in m" for axis in axes), equal=True)
 
 
-def load_fmu(path: str | Path) -> Fmu:
-    """Read and check an FMU's description, without unzipping or running it.
-
-    Raises:
-        FmuError: the file is missing, is no zip archive, is unsafe to unzip, is no co-simulation FMU of FMI 2.0 or 3.0,
-            or has no outputs q[i] and v[i].
-    """
-    fmu = load_any_fmu(path)
-    n = len(fmu.vector("q"))
-    if not fmu.joints:
-        fmu = replace(fmu, joints=tuple(f"joint{i + 1}" for i in range(n)))
-    logged = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
-    kinds = {(variable.causality, variable.type) for variable in logged}
-    if len(logged) != 2 * n or kinds != {("output", "Real")}:
-        raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
-    if len(fmu.joints) != n:
-        raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
-    _check_task(fmu)
-    return fmu
-
-
-def load_any_fmu(path: str | Path) -> Fmu:
+def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     """Read the description of any co-simulation FMU, of a robot or not; ``joints`` may be empty.
 
+    Args:
+        path: the FMU, or a system.
+        inside: member of the system that is the FMU.
+
     Raises:
-        FmuError: as ``load_fmu``, but q[i] and v[i] are not required.
+        FmuError: the file is missing, is no zip archive, is unsafe to unzip, or is no co-simulation FMU of FMI 2.0 or
+            3.0.
     """
-    path = Path(path)
-    xml, members = _read(path)
+    path, where = Path(path), Path(path, inside)
+    xml, members = read_archive(path, inside)
     try:
         root = ET.fromstring(xml)
         description = read_description(root, xml)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
-        raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
+        raise FmuError(f"'{where}': modelDescription.xml is not valid: {error!s:.300}") from error
     if not re.match(r"[23]\.0", description.fmiVersion) or description.coSimulation is None:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
-        raise FmuError(f"'{path}' is FMI {description.fmiVersion} {kind}; FMI 2.0 or 3.0 co-simulation is needed")
+        raise FmuError(f"'{where}' is FMI {description.fmiVersion} {kind}; FMI 2.0 or 3.0 co-simulation is needed")
     simulation = root.find("CoSimulation[@providesDirectionalDerivatives]")
     if simulation is not None:  # FMPy expects the name of FMI 2.0
         derivatives = simulation.get("providesDirectionalDerivatives") in ("true", "1")
@@ -211,12 +199,14 @@ def load_any_fmu(path: str | Path) -> Fmu:
         members=members,
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
         **_vendor_annotation(root),
+        inside=inside,
+        described=len(xml),
     )
     for name, variable in fmu.variables.items():
         try:
             _ = variable.start_value
         except ValueError:
-            raise FmuError(f"'{path}': start value of {name}, '{variable.start:.50}', is no number") from None
+            raise FmuError(f"'{where}': start value of {name}, '{variable.start:.50}', is no number") from None
     return fmu
 
 
@@ -226,7 +216,7 @@ def problems_of(path: Path) -> list[str]:
     Raises:
         FmuError: there is no description to read.
     """
-    xml, _ = _read(path)
+    xml, _ = read_archive(path, "")
     try:
         read_description(ET.fromstring(xml), xml, validate_variable_names=True, validate_model_structure=True)
     except ValidationError as error:
@@ -236,8 +226,21 @@ def problems_of(path: Path) -> list[str]:
     return []
 
 
-def _check_task(fmu: Fmu) -> None:
-    """Refuse task vectors of a wrong length."""
+def logged(fmu: Fmu) -> Fmu:
+    """Return an FMU with outputs q[i] and v[i], its joints named.
+
+    Raises:
+        FmuError: it has no such outputs, or not as many as joints, or task vectors of a wrong length.
+    """
+    n = len(fmu.vector("q"))
+    if not fmu.joints:
+        fmu = replace(fmu, joints=tuple(f"joint{i + 1}" for i in range(n)))
+    states = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
+    kinds = {(variable.causality, variable.type) for variable in states}
+    if len(states) != 2 * n or kinds != {("output", "Real")}:
+        raise FmuError(f"'{fmu.path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
+    if len(fmu.joints) != n:
+        raise FmuError(f"'{fmu.path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):
         raise FmuError(f"'{fmu.path}': its axes '{fmu.axes:.50}' are not different ones of 'xyz'")
     for group in ("x", "x_des") if fmu.axes else ():
@@ -246,6 +249,7 @@ def _check_task(fmu: Fmu) -> None:
             raise FmuError(f"'{fmu.path}': {group} has {len(names)} elements for the axes '{fmu.axes}'")
         if group == "x_des" and any(fmu.variables[name].start is None for name in names):
             raise FmuError(f"'{fmu.path}': x_des has no start values")
+    return fmu
 
 
 @contextmanager
@@ -256,8 +260,8 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
         FmuError: the file was replaced meanwhile, or cannot be read.
     """
     try:
-        with zipfile.ZipFile(fmu.path) as archive:
-            if _checksums(archive) != fmu.members:
+        with open_archive(fmu.path, fmu.inside) as archive:
+            if checksums(archive) != fmu.members:
                 raise FmuError(f"'{fmu.path}' was replaced by another FMU after it had been read")
             yield archive
     except ZIP_ERRORS as error:
@@ -269,33 +273,6 @@ def read_resource(fmu: Fmu, name: str) -> bytes | None:
     with opened(fmu) as archive, suppress(KeyError):
         return read_member(archive, f"resources/{name}", MAX_RESOURCE)
     return None
-
-
-def _read(path: Path) -> tuple[bytes, dict[str, int]]:
-    """Check that an archive is safe to unzip; return its modelDescription.xml and its members' checksums."""
-    try:
-        check_archive(path)
-        with zipfile.ZipFile(path) as archive:
-            xml = read_member(archive, "modelDescription.xml", MAX_DESCRIPTION)
-    except (FileNotFoundError, IsADirectoryError) as error:
-        raise FmuError(no_such("FMU", path)) from error
-    except OSError as error:
-        raise FmuError(f"cannot read '{path}': {error.strerror}") from error
-    except KeyError as error:
-        raise FmuError(f"'{path}' is no FMU: it has no modelDescription.xml") from error
-    except UnsafeArchiveError as error:
-        raise FmuError(f"'{path}': {error}") from error
-    except ZIP_ERRORS as error:
-        other = kind_of(path) not in ("", "FMU")
-        why = f"'{path}' is no FMU: it is not a sound zip archive ({error})"
-        raise FmuError(no_such("FMU", path) if other else why) from error
-    if not is_plain_xml(xml):
-        raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
-    return xml, _checksums(archive)
-
-
-def _checksums(archive: zipfile.ZipFile) -> dict[str, int]:
-    return {member.filename: member.CRC for member in archive.infolist()}
 
 
 def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, choice
 from .description import Fmu
-from .instance import instantiate
 from .reference_runs import Reference, Values
+from .system_instance import instantiate_fmu
 
 Rows = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
@@ -22,7 +22,7 @@ NANOSECONDS = 1_000_000_000
 
 def in_this_master(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     """Run by this package's own calls."""
-    with instantiate(fmu) as instance:
+    with instantiate_fmu(fmu) as instance:
         instance.initialise(reference.start, inf, _starts(fmu, reference))
         return reference.rows(instance.set, instance.step, instance.reader(names))
 

@@ -7,12 +7,12 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
-from functools import partial
 from itertools import accumulate, chain
 from math import inf
 from pathlib import Path
 from threading import Lock
 from typing import Any, NoReturn
+from weakref import WeakValueDictionary
 
 import fmpy
 import numpy as np
@@ -21,16 +21,12 @@ from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
 from ..errors import FmuError, SimulationError
-from ..export.python_wrapper import check_python_wrapper
-from ..files import temporary_folder
-from .description import Fmu, opened
+from .description import Fmu
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Log levels of the FMI statuses ok, warning, discard and error; fatal is CRITICAL."""
 WARNING = fmi2.fmi2Warning
-READ = ("documentation/", "sources/")
-"""Folders of an FMU that its library does not need."""
 LOADING = Lock()
 Values = Array[c_double]
 
@@ -76,7 +72,7 @@ class Instance:
     def __init__(self, fmu: Fmu, folder: Path) -> None:
         self.fmu = fmu
         self._said = ""
-        self._fatal = False
+        self._fatal = self._running = False
         self._ends = c_bool()  # doStep's argument terminateSimulation in FMI 3.0
         self._t, self._h = c_double(), c_double()
         starts: dict[tuple[str, int], list[float | bool]] = {}
@@ -100,23 +96,36 @@ class Instance:
 
         with _loading():
             slave = fmi2.FMU2Slave(**what)
+        HEARD[id(self)] = self
         self._callbacks = fmi2.fmi2CallbackFunctions(
-            logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
+            logger=LOGGER,
+            componentEnvironment=id(self),
             allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc),
             freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free),
         )
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
         self._setters = {"Real": slave.setReal, "Integer": slave.setInteger, "Boolean": slave.setBoolean}
+        self._getters = {"Integer": slave.getInteger, "Boolean": slave.getBoolean}
         self._do_step, self._get = slave.dll["fmi2DoStep"], slave.dll["fmi2GetReal"]
+        self._put = slave.dll["fmi2SetReal"]
         self._rest: tuple[object, ...] = (c_int(1),)
         return slave
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
         """Set start values, and enter and exit initialisation mode; the stop time may be infinite."""
+        self.begin(start_time, stop_time, values)
+        self.start()
+
+    def begin(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
+        """Set start values and enter initialisation mode."""
         self.set(values)
         self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
+
+    def start(self) -> None:
+        """Exit initialisation mode."""
         self._accept(self.slave.exitInitializationMode)
+        self._running = True
 
     def _set_up(self, **times: float | None) -> None:
         self._accept(self.slave.setupExperiment, **times)
@@ -125,6 +134,7 @@ class Instance:
     def reset(self) -> None:
         """Reset to the state after instantiation."""
         self._accept(self.slave.reset)
+        self._running = False
         self._vectors = dict(self._starts)
 
     def set(self, values: Mapping[str, float | bool]) -> None:
@@ -185,6 +195,36 @@ class Instance:
 
         return read_elements
 
+    def writer(self, names: Sequence[str]) -> Callable[[list[float]], None]:
+        """Return a function that sets Real variables; other elements of their vectors keep their last values."""
+        distinct, columns, size = self._columns(names)
+        references, whole = (c_uint * len(distinct))(*distinct), (c_double * size)()
+        given = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
+        put, arguments, in_order = self._put, (self._component, *given), columns == [*range(size)]
+
+        def write(values: list[float]) -> None:
+            self._said = ""
+            if in_order:
+                whole[:] = [*values]
+            else:
+                whole[:] = [*chain(*(self._vectors["Real", reference] for reference in distinct))]
+                for column, value in zip(columns, values):
+                    whole[column] = value
+            if (status := put(*arguments)) > WARNING:
+                self._refuse(status)
+
+        return write
+
+    def value(self, name: str) -> float | bool:
+        """Return the value of an Integer or Boolean variable."""
+        variable = self.fmu.variables[name]
+        size = len(self._starts[variable.type, variable.reference])
+        try:
+            read = self._getters[variable.type]([variable.reference], *self._of_size(size))[variable.element]
+        except FMICallException as error:
+            self._refuse(error.status)
+        return bool(read) if variable.type == "Boolean" else int(read)
+
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
         """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
         distinct, rows, size = self._columns(unknown)
@@ -204,7 +244,8 @@ class Instance:
         if self._fatal:
             return
         with suppress(FMICallException):  # after a failure, terminate may be refused
-            self.slave.terminate()
+            if self._running:
+                self.slave.terminate()
         self.slave.freeInstance()
 
     def _refuse(self, status: int) -> NoReturn:
@@ -240,11 +281,25 @@ class Instance:
         if self._said:
             raise SimulationError(self._said)
 
-    def _log(self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes) -> None:
+    def log(self, status: int, _category: bytes, text: bytes) -> None:
+        """Log a message of the FMU, and keep that of an error for the exception to come."""
         message = text.decode("utf-8", "replace").strip()
         if status > WARNING:
             self._said = message
         logger.log(LEVELS.get(status, logging.CRITICAL), message)
+
+
+HEARD: WeakValueDictionary[int, Instance] = WeakValueDictionary()
+"""Instances of FMI 2.0 by their environment."""
+
+
+def _pass_on(environment: int, _name: bytes, status: int, category: bytes, text: bytes) -> None:
+    """Pass a message to its instance; FMPy's proxy has one logger for all instances of the process."""
+    if (instance := HEARD.get(environment)) is not None:
+        instance.log(status, category, text)
+
+
+LOGGER = fmi2.fmi2CallbackLoggerTYPE(_pass_on)
 
 
 class Instance3(Instance):
@@ -253,10 +308,12 @@ class Instance3(Instance):
     def _instantiate(self, **what: str) -> Any:
         with _loading():
             slave = fmi3.FMU3Slave(**what)
-        slave.instantiate(logMessage=partial(self._log, b""), loggingOn=True)
+        slave.instantiate(logMessage=lambda _environment, *message: self.log(*message), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
         self._setters = {"Real": slave.setFloat64, "Integer": slave.setInt32, "Boolean": slave.setBoolean}
+        self._getters = {"Integer": slave.getInt32, "Boolean": slave.getBoolean}
         self._do_step, self._get = slave.dll["fmi3DoStep"], slave.dll["fmi3GetFloat64"]
+        self._put = slave.dll["fmi3SetFloat64"]
         self._rest = (c_bool(True), *results)
         return slave
 
@@ -265,31 +322,3 @@ class Instance3(Instance):
 
     def _of_size(self, size: int) -> tuple[int, ...]:
         return (size,)
-
-
-@contextmanager
-def instantiate(fmu: Fmu) -> Iterator[Instance]:
-    """Instantiate an FMU from a temporary folder, and free the instance at the end.
-
-    Its documentation is not unzipped.
-
-    Raises:
-        FmuError: it has no binary for this platform, or cannot be unzipped or loaded.
-    """
-    if fmu.platform not in fmu.platforms:
-        here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
-        there = ", ".join(fmu.platforms) or "none"
-        remedy = "" if fmu.platform else "; build one with `native` and `fmi` 3"
-        reason = f"has no binary for this platform ({here}), only for: {there}{remedy}"
-        raise FmuError(f"'{fmu.path}' {reason}")
-    with temporary_folder() as folder:
-        with opened(fmu) as archive:
-            names = archive.namelist()
-            archive.extractall(folder, [name for name in names if not name.startswith(READ)])
-        library = folder / "binaries" / fmu.platform / fmu.library
-        check_python_wrapper(fmu.path, library, folder)
-        instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder)
-        try:
-            yield instance
-        finally:
-            instance.free()

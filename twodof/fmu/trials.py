@@ -18,8 +18,9 @@ from fmpy.model_description import ModelVariable
 from ..errors import SimulationError
 from .description import Fmu
 from .importers import TOOLS, Run, in_this_master
-from .instance import Instance, instantiate
+from .instance import Instance
 from .reference_runs import Reference
+from .system_instance import instantiate_fmu
 
 STEPS = 20
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
@@ -80,7 +81,7 @@ class Trial:
     def instance(self, values: Mapping[str, float] | None = None) -> Iterator[Instance]:
         """Instantiate and initialise the FMU."""
         self.note("instantiation and initialisation")
-        with instantiate(self.fmu) as instance:
+        with instantiate_fmu(self.fmu) as instance:
             instance.initialise(self.start, inf, values or {})
             yield instance
 

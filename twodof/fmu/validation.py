@@ -5,6 +5,7 @@ import io
 import math
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -16,6 +17,9 @@ from ..bounds import MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME
 
 SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3": "fmi3/fmi3ModelDescription"}
 """Schema files in FMPy, by the major version of FMI."""
+TRUE = ("true", "1")
+NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": TRUE.__contains__}
+"""Supported types of variables, and functions that parse their start values."""
 
 
 def is_plain_xml(xml: bytes) -> bool:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ class Variable:
         unit: FMI unit name, or "".
         start: start value; None for computed variables.
         description: one line.
+        called: name of the vector in the FMU, where it is not the group's; "" else.
+        shown: whether the FMU has it; a part of the plant's engine otherwise.
     """
 
     group: str
@@ -64,11 +66,13 @@ class Variable:
     unit: str
     start: Value | None
     description: str
+    called: str = ""
+    shown: bool = True
 
     @property
     def name(self) -> str:
         """FMI name, e.g. "x_des[1]"."""
-        group = self.derivative_of or self.group
+        group = self.called or self.derivative_of or self.group
         name = group if self.index is None else f"{group}[{self.index + 1}]"
         return f"der({name})" if self.derivative_of else name
 
@@ -136,6 +140,12 @@ CONTROLS = {
 """
 
 DISTURBANCES = ("tau_ext", "f_ext")
+OF_THE_PLANT = {
+    *DISTURBANCES,
+    *("x", "xd", "quat", "omega", "q_start", "v_start", "q_min", "q_max", "rtol", "atol", "max_step"),
+    *("friction", "damping", "integrator", "rigid_stops"),
+}
+"""Groups that a controller alone does not have."""
 OF_A_LAW = {group for law in CONTROLS.values() for group in (*law.outputs, *law.parameters)}
 
 ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ...] = (
@@ -231,6 +241,23 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
             assert not isinstance(start, tuple)
             table.append(Variable(group, None, causality, unit, start, text))
     return table
+
+
+def controller_table(table: Sequence[Variable]) -> list[Variable]:
+    """Return the table of the controller alone: q and v are inputs, tau is its output tau_cmd."""
+    starts = {(v.group, v.index): v.start for v in table}
+    rows = []
+    for variable in table:
+        shown = variable.group not in OF_THE_PLANT and variable.causality != "local"
+        variable = replace(variable, shown=shown)
+        if variable.group in ("q", "v"):
+            start = starts[f"{variable.group}_start", variable.index]
+            variable = replace(variable, causality="input", start=start)
+        elif variable.group == "tau":
+            text = variable.description.replace("control effort applied", "effort of the controller")
+            variable = replace(variable, called="tau_cmd", description=text)
+        rows.append(variable)
+    return rows
 
 
 def _owners(robot: Robot, law: Control) -> dict[str, list[str]]:

@@ -20,7 +20,7 @@ from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import InputError, SimulationError, diverged, step_failure
-from ..fmu import Fmu, Instance, instantiate
+from ..fmu import Fmu, Instance, SystemInstance, instantiate
 from ..plant.urdf import Urdf
 from ..signatures import ignore, never, with_keywords_of
 from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
@@ -54,7 +54,7 @@ def samples(
     stop: Stop = never,
     ready: Callable[[], object] = ignore,
     resume: Resume = ignore,
-    instance: Instance | None = None,
+    instance: Instance | SystemInstance | None = None,
     **options: Unpack[ExperimentOptions],
 ) -> Samples:
     """Run an FMU; yield the initial state, then one sample per communication step.
@@ -87,7 +87,7 @@ def _stepped(
     stop: Stop,
     ready: Callable[[], object],
     resume: Resume,
-    instance: Instance | None,
+    instance: Instance | SystemInstance | None,
 ) -> Samples:
     """Yield the samples of a run; the judge receives the outputs of each as a buffer."""
     kinds, due = run.fmu.variables, deque(run.changes)
@@ -147,7 +147,7 @@ def as_experiment(
 
 
 def _sampler(
-    instance: Instance, run: Experiment, watch: Callable[[memoryview], object]
+    instance: Instance | SystemInstance, run: Experiment, watch: Callable[[memoryview], object]
 ) -> Callable[[int, Mapping[str, Value], float], Sample]:
     """Return a function that reads the outputs after k steps, with the inputs and their start time."""
     groups = [run.fmu.vector(group) for group in (*OUTPUTS, "q_meas", "v_meas")]
@@ -214,7 +214,7 @@ def simulate(
     *sinks: Sink,
     pace: RealTime | None = None,
     stop: Stop = never,
-    instance: Instance | None = None,
+    instance: Instance | SystemInstance | None = None,
     steer: Steer = ignore,
     resume: Resume = ignore,
     **options: Unpack[ExperimentOptions],
@@ -251,7 +251,7 @@ class Member(NamedTuple):
     sinks: Sequence[Sink]
     steer: Steer = ignore
     resume: Resume = ignore
-    instance: Instance | None = None
+    instance: Instance | SystemInstance | None = None
 
     def steered(self, pace: RealTime | None, stop: Stop) -> Steer:
         """Return a function that returns the new inputs after a sample; inputs from sinks take precedence."""

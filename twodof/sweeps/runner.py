@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import SimulationError, diverged, step_failure
 from ..files import temporary_folder
-from ..fmu import Instance, instantiate
+from ..fmu import Instance, SystemInstance, instantiate
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import resolve
 from ..simulation.judge import OUTPUTS, Judge
@@ -57,7 +57,7 @@ class Runner:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._instance: Instance | None = None
+        self._instance: Instance | SystemInstance | None = None
         self._used = ExitStack()  # contexts that the instance needs
         with ExitStack() as stack:
             folder = stack.enter_context(temporary_folder())
@@ -118,7 +118,7 @@ class Runner:
         begin = time.perf_counter()
         return [self.run(point) for point in points], time.perf_counter() - begin
 
-    def _fresh(self) -> Instance:
+    def _fresh(self) -> Instance | SystemInstance:
         """Return the instance in its state after instantiation."""
         if self._instance is None:
             self._instance = self._used.enter_context(instantiate(self._base.fmu))
@@ -137,7 +137,7 @@ def lost(point: Point, end: float, outcome: str, message: str) -> Row:
     return (number, *values, *[nan] * len(METRICS), end, outcome, message)
 
 
-def trace(run: Experiment, instance: Instance) -> Array:
+def trace(run: Experiment, instance: Instance | SystemInstance) -> Array:
     """Return the outputs q, v, x, tau and quat side by side at all samples of a run without changes, N + 1 × values.
 
     It makes no ``Sample`` objects, to save time. Errors are those of ``samples``.

@@ -1,0 +1,86 @@
+/* A co-simulation FMU of FMI 2.0: tau = Kp (q_des - q) - Kd v of N joints, and a count of its steps. */
+#include <stdlib.h>
+
+#include "fmi2FunctionTypes.h"
+
+enum { N = 2, Q = 0, V = N, Q_DES = 2 * N, TAU = 3 * N, KP = 4 * N, KD, ENABLED = 50, STEPS = 60 };
+
+typedef struct {
+    double value[KD + 1];
+    int enabled, steps;
+} Controller;
+
+const char *fmi2GetVersion(void) { return "2.0"; }
+const char *fmi2GetTypesPlatform(void) { return "default"; }
+
+fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String where,
+                              const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging)
+{
+    Controller *c = calloc(1, sizeof *c);
+    (void)name, (void)type, (void)guid, (void)where, (void)functions, (void)visible, (void)logging;
+    c->value[KP] = 10.0;
+    c->value[KD] = 2.0;
+    c->enabled = 1;
+    return c;
+}
+
+void fmi2FreeInstance(fmi2Component c) { free(c); }
+fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start,
+                               fmi2Boolean has_stop, fmi2Real stop)
+{
+    (void)c, (void)has_tolerance, (void)tolerance, (void)start, (void)has_stop, (void)stop;
+    return fmi2OK;
+}
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return (void)c, fmi2OK; }
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return (void)c, fmi2OK; }
+fmi2Status fmi2Terminate(fmi2Component c) { return (void)c, fmi2OK; }
+fmi2Status fmi2Reset(fmi2Component c) { return ((Controller *)c)->steps = 0, fmi2OK; }
+
+fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real value[])
+{
+    for (size_t i = 0; i < n; i++)
+        ((Controller *)c)->value[vr[i]] = value[i];
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference vr[], size_t n, fmi2Real value[])
+{
+    Controller *c = component;
+    for (int i = 0; i < N; i++)
+        c->value[TAU + i] = c->enabled ? c->value[KP] * (c->value[Q_DES + i] - c->value[Q + i])
+                                             - c->value[KD] * c->value[V + i] : 0.0;
+    for (size_t i = 0; i < n; i++)
+        value[i] = c->value[vr[i]];
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Boolean value[])
+{
+    (void)vr;
+    if (n > 0)
+        ((Controller *)c)->enabled = value[0];
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Integer value[])
+{
+    (void)vr;
+    for (size_t i = 0; i < n; i++)
+        value[i] = ((Controller *)c)->steps;
+    return fmi2OK;
+}
+
+/* The calls that no importer makes: FMPy only loads a library that has them all. */
+#define NEVER(name) fmi2Status fmi2##name(void) { return fmi2Error; }
+NEVER(SetDebugLogging) NEVER(GetBoolean) NEVER(GetString) NEVER(SetInteger) NEVER(SetString) NEVER(GetFMUstate)
+NEVER(SetFMUstate) NEVER(FreeFMUstate) NEVER(SerializedFMUstateSize) NEVER(SerializeFMUstate)
+NEVER(DeSerializeFMUstate) NEVER(GetDirectionalDerivative) NEVER(SetRealInputDerivatives)
+NEVER(GetRealOutputDerivatives) NEVER(CancelStep) NEVER(GetStatus) NEVER(GetRealStatus) NEVER(GetIntegerStatus)
+NEVER(GetBooleanStatus) NEVER(GetStringStatus)
+
+fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean last)
+{
+    (void)t, (void)h, (void)last;
+    ((Controller *)c)->steps++;
+    return fmi2OK;
+}

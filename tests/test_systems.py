@@ -1,0 +1,336 @@
+"""Systems of FMUs: connections, values and nested systems of SSP files, against a loop in Python."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from systems import NAMESPACES, WIRES, component, connection, connectors, loop, pd_fmu, ssd, zipped
+
+import twodof
+from twodof.cli.main import main
+from twodof.errors import FmuError, InputError
+
+H, N = 0.01, 50
+TARGET = np.array([0.3, 0.2])
+GAINS = {"pd.Kp": 0.1, "pd.Kd": 0.01}
+DEGREE = '<ssc:Unit name="deg"><ssc:BaseUnit rad="1" factor="0.017453292519943295"/></ssc:Unit>'
+BOTH = f"<ssd:Elements>{component('plant')}{component('pd')}</ssd:Elements>"
+
+
+@pytest.fixture(scope="session")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The native effort plant of the default arm."""
+    path = tmp_path_factory.mktemp("plant") / "plant.fmu"
+    return twodof.build_fmu(path, twodof.FmuOptions(native=True, control="effort")).read_bytes()
+
+
+@pytest.fixture(scope="session")
+def pd() -> bytes:
+    """The controller of another maker."""
+    return pd_fmu()
+
+
+def law(q: np.ndarray, v: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """Return the effort of native/pd.c, with q_des and q multiplied."""
+    return scale * 0.1 * (TARGET - q) - 0.01 * v
+
+
+def by_hand(plant: bytes, path: Path, control=law, **settings: object) -> np.ndarray:
+    """Return q of a loop in which Python is the controller, N + 1 × 2."""
+    path.write_bytes(plant)
+    run = twodof.samples(path, step=H, stop_time=N * H, settings=settings)
+    rows = [next(run).q]
+    tau = control(*map(np.array, (rows[0], np.zeros(2))))
+    for _ in range(N):
+        sample = run.send({"tau_cmd": tau})
+        rows.append(sample.q)
+        tau = control(np.array(sample.q), np.array(sample.v))
+    run.close()
+    return np.array(rows)
+
+
+def q_of(path: Path, **settings: object) -> np.ndarray:
+    """Return q of a system, N + 1 × 2."""
+    given = {name.replace("__", "."): value for name, value in settings.items()}
+    return np.array([sample.q for sample in twodof.samples(path, step=H, stop_time=N * H, settings=given)])
+
+
+def values(*rows: str, more: str = "") -> str:
+    """Return the XML of a parameter set, of rows "name kind value [unit]"."""
+    parameters = ""
+    for name, kind, value, *unit in map(str.split, rows):
+        units = f' unit="{unit[0]}"' if unit else ""
+        parameters += f'<ssv:Parameter name="{name}"><ssv:{kind} value="{value}"{units}/></ssv:Parameter>'
+    return (
+        f'<ssv:ParameterSet {NAMESPACES} version="1.0" name="set"><ssv:Parameters>{parameters}</ssv:Parameters>'
+        f"{more}</ssv:ParameterSet>"
+    )
+
+
+def binding(content: str = "", mapping: str = "", attributes: str = "") -> str:
+    """Return the XML of an inline binding, or of one with attributes such as a source."""
+    inline = f"<ssd:ParameterValues>{content}</ssd:ParameterValues>" if content else ""
+    return (
+        f"<ssd:ParameterBindings><ssd:ParameterBinding {attributes}>{inline}{mapping}</ssd:ParameterBinding>"
+        "</ssd:ParameterBindings>"
+    )
+
+
+GIVEN = values("q_des[1] Real 0.3", "q_des[2] Real 0.2", "Kp Real 0.1", "Kd Real 0.01")
+
+
+@pytest.mark.parametrize("order", ["plant pd", "pd plant"])
+def test_a_loop_is_that_of_its_controller_in_python(plant: bytes, pd: bytes, tmp_path: Path, order: str) -> None:
+    """An output that depends directly on inputs is of the same instant, whatever the order of components."""
+    elements = "".join(component(name, binding(GIVEN) if name == "pd" else "") for name in order.split())
+    structure = ssd(f"<ssd:Elements>{elements}</ssd:Elements><ssd:Connections>{WIRES}</ssd:Connections>")
+    system = loop(tmp_path / "loop.ssp", plant, pd, structure)
+    expected = by_hand(plant, tmp_path / "plant.fmu", payload=0.02)
+    assert np.ptp(expected) > 0.1
+    np.testing.assert_array_equal(q_of(system, plant__payload=0.02), expected)
+    np.testing.assert_array_equal(q_of(system, payload=0.02), expected)
+
+
+def test_units_are_converted_and_not_where_that_is_suppressed(plant: bytes, tmp_path: Path) -> None:
+    degrees = pd_fmu(unit="deg", factor=np.pi / 180.0)
+    settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
+    scaled = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: law(q, v, 180.0 / np.pi))
+    system = loop(tmp_path / "loop.ssp", plant, degrees)
+    np.testing.assert_allclose(q_of(system, **settings), scaled, rtol=0, atol=1e-9)
+    wires = "".join(
+        connection(f"{a}[{i}]", f"{b}[{i}]", more='suppressUnitConversion="true"')
+        for i in (1, 2)
+        for a, b in (("plant.q", "pd.q"), ("plant.v", "pd.v"), ("pd.tau", "plant.tau_cmd"))
+    )
+    system = loop(tmp_path / "loop.ssp", plant, degrees, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
+    plain = by_hand(plant, tmp_path / "plant.fmu")
+    np.testing.assert_array_equal(q_of(system, **{**settings, "pd__q_des": TARGET}), plain)
+
+
+def nested(plant: bytes, pd: bytes, path: Path, factor: float = 2.0) -> Path:
+    """Write a system whose controller is two systems deep, with a gain and an offset before its target."""
+    kinds = {"q": "input", "v": "input", "goal": "input deg", "tau": "output"}
+    ports = connectors({f"{name}[{i}]": kind for i in (1, 2) for name, kind in kinds.items()})
+    down = [(f"{n}[{i}]", f"{{}}.{n}[{i}]") for i in (1, 2) for n in ("q", "v")]
+    up = [(f"{{}}.tau[{i}]", f"tau[{i}]") for i in (1, 2)]
+    scaled = f'<ssc:LinearTransformation factor="{factor}" offset="0.1"/>'
+    wires = {
+        name: "".join(connection(a.format(name), b.format(name)) for a, b in down + up) for name in ("pd", "inner")
+    }
+    wires["pd"] += "".join(connection(f"goal[{i}]", f"pd.q_des[{i}]", scaled) for i in (1, 2))
+    wires["inner"] += "".join(connection(f"goal[{i}]", f"inner.goal[{i}]") for i in (1, 2))
+    inner, body = component("pd"), ""
+    for name, own in (("inner", "pd"), ("outer", "inner")):
+        body = (
+            f'<ssd:System name="{name}">{ports}<ssd:Elements>{inner}</ssd:Elements>'
+            f"<ssd:Connections>{wires[own]}</ssd:Connections></ssd:System>"
+        )
+        inner = body
+    top = WIRES.replace('"pd"', '"outer"')
+    top += "".join(connection(f"goal[{i}]", f"outer.goal[{i}]") for i in (1, 2))
+    units = (
+        '<ssd:Units><ssc:Unit name="deg"><ssc:BaseUnit rad="1" factor="0.017453292519943295"/></ssc:Unit></ssd:Units>'
+    )
+    system = (
+        connectors({f"goal[{i}]": "input deg" for i in (1, 2)})
+        + f"<ssd:Elements>{component('plant')}{body}</ssd:Elements><ssd:Connections>{top}</ssd:Connections>"
+    )
+    return loop(path, plant, pd, ssd(system, units))
+
+
+def test_nested_systems_are_flattened_and_transformations_come_after_units(
+    plant: bytes, pd: bytes, tmp_path: Path
+) -> None:
+    system = nested(plant, pd, tmp_path / "nested.ssp")
+    fmu = twodof.load_fmu(system)
+    assert next(iter(fmu.groups("input"))) == "goal"
+    assert fmu.variables["goal[1]"].unit == "deg"
+    np.testing.assert_allclose(fmu.start_values["goal[1]"], np.rad2deg(-0.1 / 2.0), rtol=1e-12)  # where q_des is 0
+    settings = {"outer__inner__pd__Kp": 0.1, "outer__inner__pd__Kd": 0.01, "goal": np.rad2deg((TARGET - 0.1) / 2.0)}
+    expected = by_hand(plant, tmp_path / "plant.fmu")
+    np.testing.assert_allclose(q_of(system, **settings), expected, rtol=0, atol=1e-12)
+    run = twodof.samples(system, step=H, stop_time=H, settings={"goal": 0.0, **{"outer.inner.pd.Kp": 0.1}})
+    first = next(run)
+    moved = run.send({"goal": 90.0})
+    assert (first.inputs["goal[1]"], moved.inputs["goal[1]"]) == (0.0, 90.0)
+
+
+def test_values_come_from_sets_and_mappings_the_outermost_last(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    units = (
+        '<ssv:Units><ssc:Unit name="deg"><ssc:BaseUnit rad="1" factor="0.017453292519943295"/></ssc:Unit></ssv:Units>'
+    )
+    angles = [f"goal{i + 1} Real {float(np.rad2deg(angle))!r} deg" for i, angle in enumerate(TARGET)]
+    mapped = "".join(
+        f'<ssm:MappingEntry source="{source}" target="{target}">{inside}</ssm:MappingEntry>'
+        for source, target, inside in (
+            ("goal1", "pd.q_des[1]", ""),
+            ("goal2", "pd.q_des[2]", ""),
+            ("half", "pd.Kp", '<ssc:LinearTransformation factor="2"/>'),
+        )
+    )
+    ssm = f'<ssm:ParameterMapping {NAMESPACES} version="1.0">{mapped}</ssm:ParameterMapping>'
+    outer = binding(
+        mapping='<ssd:ParameterMapping source="maps/map.ssm"/>', attributes='source="sets/my%20set.ssv" prefix=""'
+    )
+    own = values("Kp Real 77", "Kd Real 0.01", "unknown Real 1")
+    elements = f"<ssd:Elements>{component('plant')}{component('pd', binding(own))}</ssd:Elements>"
+    structure = ssd(f"{outer}{elements}<ssd:Connections>{WIRES}</ssd:Connections>")
+    text = values(*angles, "half Real 0.05", "Kd Real 5", more=units)
+    files = {"sets/my set.ssv": text.encode(), "maps/map.ssm": ssm.encode()}
+    system = loop(tmp_path / "loop.ssp", plant, pd, structure, **files)
+    starts = twodof.load_fmu(system).start_values
+    assert (starts["pd.Kp"], starts["pd.Kd"]) == (0.1, 0.01)
+    np.testing.assert_allclose(q_of(system), by_hand(plant, tmp_path / "plant.fmu"), rtol=0, atol=1e-12)
+
+
+def test_truth_values_are_connected(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    on = connectors({"on": "input"}, "<ssc:Boolean/>")
+    wires = WIRES + connection("on", "pd.enabled")
+    system = loop(tmp_path / "loop.ssp", plant, pd, ssd(f"{on}{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
+    settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=TARGET)
+    np.testing.assert_array_equal(q_of(system, on=True, **settings), by_hand(plant, tmp_path / "plant.fmu"))
+    free = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: np.zeros(2))
+    np.testing.assert_array_equal(q_of(system, on=False, **settings), free)
+
+
+def test_the_bag_of_a_system_names_its_fmus_and_info_draws_it(
+    plant: bytes, pd: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    system, bag = loop(tmp_path / "loop.ssp", plant, pd), tmp_path / "bag"
+    gains = [text for name, value in GAINS.items() for text in ("--set", f"{name}={value}")]
+    times = ["--stop-time", "0.5", "--set", "plant.payload=0.02", "--set", "pd.q_des=0.3,0.2"]
+    assert main(["run", str(system), "-o", str(bag), *times, *gains, "--scene", "--effort"]) == 0
+    recorded = twodof.read_bag(bag)
+    np.testing.assert_array_equal(recorded.q, by_hand(plant, tmp_path / "plant.fmu", payload=0.02))
+    provenance = json.loads((bag / "run.json").read_text())
+    assert provenance["start_values"]["pd.Kp"] == 0.1
+    assert provenance["start_values"]["payload"] == 0.02
+    assert [*provenance["system"]["components"]] == ["plant", "pd"]
+    capsys.readouterr()
+    assert main(["info", str(system)]) == 0
+    assert "pd.tau -> plant.tau_cmd, 2 values" in capsys.readouterr().out
+
+
+def test_of_several_robots_one_is_chosen(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    elements = component("plant") + component("plant").replace('name="plant"', 'name="left"')
+    two = loop(tmp_path / "two.ssp", plant, pd, ssd(f"<ssd:Elements>{elements}</ssd:Elements>"))
+    with pytest.raises(FmuError, match="give one as `robot`: plant, left"):
+        twodof.load_fmu(two)
+    fmu = twodof.load_fmu(two, "left")
+    assert fmu.start_values["plant.payload"] == fmu.start_values["payload"] == 0.0
+    free = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: np.zeros(2), payload=0.1)
+    rows = [s.q for s in twodof.samples(fmu, step=H, stop_time=N * H, settings={"left.payload": 0.1})]
+    np.testing.assert_array_equal(rows, free)
+    with pytest.raises(FmuError, match="no component 'lefd'; did you mean 'left'"):
+        twodof.load_fmu(two, "lefd")
+
+
+def crossed(unit: str = 'suppressUnitConversion="true"') -> bytes:
+    """Return a structure in which two controllers feed each other."""
+    twin = component("pd").replace('name="pd"', 'name="twin"')
+    wires = WIRES + connection("pd.tau[1]", "twin.q[1]", more=unit)
+    wires = wires.replace(connection("plant.q[1]", "pd.q[1]"), connection("twin.tau[1]", "pd.q[1]", more=unit))
+    return ssd(
+        f"<ssd:Elements>{component('plant')}{component('pd')}{twin}</ssd:Elements>"
+        f"<ssd:Connections>{wires}</ssd:Connections>"
+    )
+
+
+def test_an_algebraic_loop_is_named(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    way = r"(?=.*pd\.q\[1\] -> pd\.tau\[1\])(?=.*twin\.q\[1\] -> twin\.tau\[1\])"
+    for controller in (pd, pd_fmu(feedthrough="")):  # without dependencies an output depends on every input
+        with pytest.raises(FmuError, match=f"algebraic loop: {way}"):
+            twodof.load_fmu(loop(tmp_path / "loop.ssp", plant, controller, crossed()))
+    delays = pd_fmu(feedthrough='dependencies=""')
+    assert len(q_of(loop(tmp_path / "loop.ssp", plant, delays, crossed()))) == N + 1
+
+
+def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
+    """Yield names, structures, files and messages of systems that are refused."""
+    wired = f"{BOTH}<ssd:Connections>{WIRES}</ssd:Connections>"
+    yield "units", crossed(""), {}, "units of different dimensions, 'N.m' and 'rad'"
+    more = f"{BOTH}<ssd:Connections>{WIRES}{{}}</ssd:Connections>"
+    yield "twice", ssd(more.format(connection("pd.tau[1]", "plant.tau_cmd[2]"))), {}, "two connections end at"
+    yield "no variable", ssd(more.format(connection("pd.tau[9]", "plant.tau_ext[1]"))), {}, r"did you mean 'tau\["
+    yield "no element", ssd(more.format(connection("dp.tau[1]", "plant.tau_ext[1]"))), {}, "names 'dp'"
+    yield "outputs", ssd(more.format(connection("pd.tau[1]", "plant.q[1]"))), {}, "not from an output to an input"
+    yield "types", ssd(more.format(connection("pd.steps", "plant.tau_ext[1]"))), {}, "of type Integer and Real"
+    own = '<ssc:MapEntry source="true" target="false"/>'.join(
+        ("<ssc:BooleanMappingTransformation>", "</ssc:BooleanMappingTransformation>")
+    )
+    yield "mapping", ssd(more.format(connection("pd.steps", "plant.seed", own))), {}, "BooleanMappingTransformation"
+    far = 'source="file:///etc/passwd"'
+    yield "far", ssd(wired.replace('source="resources/pd.fmu"', far)), {}, "is no file in it"
+    yield "up", ssd(wired.replace("resources/pd.fmu", "../pd.fmu")), {}, "is no file in it"
+    package = 'type="application/x-ssp-package" source='
+    yield "package", ssd(wired.replace("source=", package, 1)), {}, "of type application/x-ssp-package"
+    yield "schema", ssd(wired.replace("ssd:Elements", "ssd:Parts")), {}, "is not valid SSP 1.0"
+    yield "entities", b"<!DOCTYPE x [<!ENTITY a 'b'>]>" + ssd(wired), {}, "declares entities"
+    many = "".join(f'<ssd:Component name="c{i}" source="resources/pd.fmu"/>' for i in range(10_000))
+    yield "many", ssd(f"<ssd:Elements>{many}</ssd:Elements>"), {}, "more than 100 components"
+    deep = '<ssd:System name="s"><ssd:Elements>' * 500 + "</ssd:Elements></ssd:System>" * 500
+    yield "deep", ssd(f"<ssd:Elements>{deep}</ssd:Elements>"), {}, "is not valid SSP 1.0"
+    yield "slip", None, {"../out": b""}, "leaves its folder"
+    yield "no FMU", None, {"resources/pd.fmu": b"PK no zip"}, "resources/pd.fmu' is no FMU"
+    slip = zipped({"modelDescription.xml": b"<a/>", "../out": b""})
+    yield "FMU slips", None, {"resources/pd.fmu": slip}, "leaves its folder"
+    circle = "".join(
+        f'<ssd:System name="{a}">{connectors({"x": "input", "y": "output"})}<ssd:Connections>{connection("x", "y")}'
+        "</ssd:Connections></ssd:System>"
+        for a in "ab"
+    )
+    ring = connection("a.y", "b.x") + connection("b.y", "a.x") + WIRES
+    ring = ring.replace(connection("plant.q[1]", "pd.q[1]"), connection("a.y", "pd.q[1]"))
+    parts = BOTH.replace("</ssd:Elements>", circle + "</ssd:Elements>")
+    yield "circle", ssd(f"{parts}<ssd:Connections>{ring}</ssd:Connections>"), {}, "circle of systems"
+
+
+@pytest.mark.parametrize(
+    ("structure", "files", "message"), [row[1:] for row in refusals()], ids=[row[0] for row in refusals()]
+)
+def test_what_a_system_cannot_be_is_refused_at_once(
+    plant: bytes, pd: bytes, tmp_path: Path, structure: bytes | None, files: dict[str, bytes], message: str
+) -> None:
+    system = loop(tmp_path / "bad.ssp", plant, pd, structure, **files)
+    begun = time.process_time()
+    with pytest.raises(FmuError, match=re.compile(message)):
+        twodof.load_fmu(system)
+    assert time.process_time() - begun < 5.0
+    assert [*tmp_path.iterdir()] == [system]
+
+
+def test_an_fmu_that_is_a_link_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    import zipfile
+
+    system = loop(tmp_path / "link.ssp", plant, pd)
+    link = zipfile.ZipInfo("resources/link.fmu")
+    link.external_attr = 0o120777 << 16
+    with zipfile.ZipFile(system, "a") as archive:
+        archive.writestr(link, "/etc/passwd")
+    with pytest.raises(FmuError, match="leaves its folder"):
+        twodof.load_fmu(system)
+
+
+def test_a_refused_step_names_its_component(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    system = loop(tmp_path / "loop.ssp", plant, pd)
+    with pytest.raises(InputError, match=r"pd\.tau"):
+        twodof.experiment(system, settings={"pd.tau[1]": 1.0})
+    with pytest.raises(twodof.TwoDofError, match=r"'plant': tau_cmd\[1\] = inf is not finite"):
+        twodof.simulate(system, step=H, stop_time=N * H, settings={"pd.Kp": 1e300, "pd.q_des": 1e300})
+
+
+def test_what_an_fmu_alone_has_is_refused_of_a_system(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    system = loop(tmp_path / "loop.ssp", plant, pd)
+    with pytest.raises(InputError, match="is a system"):
+        twodof.linearise(system)
+    with pytest.raises(twodof.TwoDofError, match="no plant in C"):
+        twodof.page(system, tmp_path / "page.html")
+    with pytest.raises(FmuError, match="no outputs q"):
+        (tmp_path / "pd.fmu").write_bytes(pd)
+        twodof.load_fmu(tmp_path / "pd.fmu")

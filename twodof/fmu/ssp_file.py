@@ -1,0 +1,255 @@
+"""Read an SSP 1.0 file: the tree of its system, and the values that parameter bindings give.
+
+Source: System Structure and Parameterization 1.0, Modelica Association, 2019.
+"""
+
+from __future__ import annotations
+
+import math
+import posixpath
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import unquote, urlsplit
+from xml.etree import ElementTree as ET
+
+import fmpy.ssp
+import lxml.etree
+from fmpy.model_description import DefaultExperiment
+
+from ..bounds import MAX_COMPONENTS, MAX_DESCRIPTION
+from ..errors import ZIP_ERRORS, FmuError
+from ..files import check_archive, read_member
+from .validation import NUMBERS, TRUE, is_plain_xml
+
+STRUCTURE = "SystemStructure.ssd"
+SCHEMAS = Path(fmpy.ssp.__file__).parent / "schema"
+SSC, SSD, SSM, SSV = (
+    f"{{http://ssp-standard.org/SSP1/SystemStructure{name}}}"
+    for name in ("Common", "Description", "ParameterMapping", "ParameterValues")
+)
+"""Namespaces, as ElementTree writes them."""
+FMU_TYPES = ("application/x-fmu-sharedlibrary", "")
+EXPONENTS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+class Unit(NamedTuple):
+    """A unit: its name, and where it is defined exponents of base units, factor and offset."""
+
+    name: str = ""
+    exponents: tuple[int, ...] | None = None
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+class Affine(NamedTuple):
+    """The map gain·x + offset of a value."""
+
+    gain: float = 1.0
+    offset: float = 0.0
+
+    def of(self, value: float) -> float:
+        """Return the value mapped; exactly the value where the map changes nothing."""
+        return value if self == IDENTITY else self.gain * value + self.offset
+
+    def after(self, first: Affine) -> Affine:
+        """Return the map that applies ``first`` and then this one."""
+        return Affine(self.gain * first.gain, self.gain * first.offset + self.offset)
+
+    def inverse(self, value: float) -> float:
+        """Return what is mapped onto a value; the value where the gain is 0."""
+        return value if self == IDENTITY or self.gain == 0.0 else (value - self.offset) / self.gain
+
+
+IDENTITY = Affine()
+
+
+class Parameter(NamedTuple):
+    """A value of a parameter set, whether its unit is converted, and the map to apply after that."""
+
+    name: str
+    value: float | bool
+    unit: Unit
+    converts: bool = True
+    map: Affine = IDENTITY
+
+
+class Connector(NamedTuple):
+    """A connector of a system or component: its kind as SSP has it, and its unit if it states one."""
+
+    kind: str
+    unit: Unit
+
+
+@dataclass
+class Element:
+    """A system or component: full name from the top system on ("" is its own), connectors and parameter values.
+
+    Attributes:
+        source: member of the archive that is a component's FMU; "" of a system.
+        children, connections: of a system; connections as the XML elements.
+    """
+
+    name: str
+    connectors: dict[str, Connector]
+    parameters: list[Parameter]
+    source: str = ""
+    children: list[Element] = field(default_factory=list)
+    connections: list[ET.Element] = field(default_factory=list)
+
+    def walk(self) -> Iterator[Element]:
+        """Yield all elements, a system after those inside it."""
+        for child in self.children:
+            yield from child.walk()
+        yield self
+
+
+def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
+    """Return name, top system, default experiment and the text of the structure of an SSP file.
+
+    Raises:
+        FmuError: it is damaged, unsafe, not valid, or has a feature that is not supported; naming that.
+    """
+    try:
+        check_archive(path)
+        with zipfile.ZipFile(path) as archive:
+            file = _File(path, archive)
+            root = file.xml(STRUCTURE, "Description")
+            units = _units(root.find(f"{SSD}Units"))
+            top = root.find(f"{SSD}System")
+            assert top is not None  # which the schema has
+            if sum(1 for _ in top.iter(f"{SSD}Component")) > MAX_COMPONENTS:
+                raise FmuError(f"'{path}' has more than {MAX_COMPONENTS} components; OMSimulator takes larger systems")
+            default = root.find(f"{SSD}DefaultExperiment")
+            times = {} if default is None else default.attrib
+            experiment = DefaultExperiment(startTime=times.get("startTime"), stopTime=times.get("stopTime"))
+            return root.get("name", ""), file.element(top, "", units), experiment, archive.read(STRUCTURE)
+    except OSError as error:
+        raise FmuError(f"cannot read '{path}': {error.strerror or error}") from error
+    except ZIP_ERRORS as error:
+        raise FmuError(f"'{path}': {error}") from error
+
+
+class _File:
+    """An open SSP file, read by the names in its XML."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
+        self._path, self._archive, self._names = path, archive, {*archive.namelist()}
+
+    def xml(self, name: str, kind: str) -> ET.Element:
+        """Return the root of an XML member that its schema allows."""
+        if name not in self._names:
+            raise FmuError(f"'{self._path}' has no '{name}'")
+        content = read_member(self._archive, name, MAX_DESCRIPTION)
+        if not is_plain_xml(content):
+            raise FmuError(f"'{self._path}': {name} declares entities or is not UTF-8")
+        return self._checked(content, name, kind)
+
+    def _checked(self, content: bytes, name: str, kind: str) -> ET.Element:
+        try:
+            schema = lxml.etree.XMLSchema(file=SCHEMAS / f"SystemStructure{kind}.xsd")
+            lxml.etree.fromstring(content, lxml.etree.XMLParser(schema=schema))
+            return ET.fromstring(content)
+        except (lxml.etree.LxmlError, ET.ParseError) as error:
+            raise FmuError(f"'{self._path}': {name} is not valid SSP 1.0: {error!s:.300}") from error
+
+    def element(self, xml: ET.Element, name: str, units: dict[str, Unit]) -> Element:
+        """Return a system, with those inside it, or a component."""
+        connectors = {}
+        for connector in xml.iterfind(f"{SSD}Connectors/{SSD}Connector"):
+            kind = next((child for child in connector if child.tag.startswith(SSC)), None)
+            unit = "" if kind is None else kind.get("unit", "")
+            connectors[connector.get("name", "")] = Connector(connector.get("kind", ""), units.get(unit, Unit(unit)))
+        bindings = xml.iterfind(f"{SSD}ParameterBindings/{SSD}ParameterBinding")
+        parameters = [parameter for binding in bindings for parameter in self._bound(binding, name)]
+        element = Element(name, connectors, parameters)
+        if xml.tag == f"{SSD}Component":
+            form = xml.get("type", "")
+            if form not in FMU_TYPES or xml.get("implementation") == "ModelExchange":
+                what = "a Model Exchange FMU" if form in FMU_TYPES else f"of type {form}"
+                raise FmuError(f"'{self._path}': component '{name}' is {what}; a co-simulation FMU is needed")
+            element.source = self._member(xml.get("source", ""), name)
+            return element
+        for feature in ("SignalDictionaries", f"Elements/{SSD}SignalDictionaryReference"):
+            if xml.find(f"{SSD}{feature}") is not None:
+                raise FmuError(f"'{self._path}': system '{name or 'of all'}' has signal dictionaries: not supported")
+        for child in xml.iterfind(f"{SSD}Elements/*"):
+            own = f"{name}.{child.get('name')}" if name else child.get("name", "")
+            element.children.append(self.element(child, own, units))
+        if len({child.name for child in element.children}) < len(element.children):
+            raise FmuError(f"'{self._path}': system '{name or 'of all'}' has two elements of one name")
+        element.connections = [*xml.iterfind(f"{SSD}Connections/{SSD}Connection")]
+        return element
+
+    def _member(self, source: str, name: str) -> str:
+        """Return the member of the archive that a URI names."""
+        parts = urlsplit(source)
+        member = posixpath.normpath(unquote(parts.path))
+        if parts.scheme or parts.netloc or member not in self._names:
+            raise FmuError(f"'{self._path}': '{source:.80}' of '{name}' is no file in it")
+        return member
+
+    def _bound(self, binding: ET.Element, name: str) -> Iterator[Parameter]:
+        """Yield the parameters of a binding."""
+        root = self._content(binding, f"{SSD}ParameterValues", SSV, "ParameterValues", name)
+        units, prefix = _units(root.find(f"{SSV}Units")), binding.get("prefix", "")
+        given = {}
+        for xml in root.iterfind(f"{SSV}Parameters/{SSV}Parameter"):
+            kind = next(child for child in xml if child.tag.startswith(SSV))
+            text, unit = kind.get("value", ""), kind.get("unit", "")
+            of_kind = NUMBERS.get(kind.tag.removeprefix(SSV))
+            if of_kind is not None:  # no variable here takes a text
+                own = xml.get("name", "")
+                given[prefix + own] = Parameter(prefix + own, of_kind(text.strip()), units.get(unit, Unit(unit)))
+        mapping = binding.find(f"{SSD}ParameterMapping")
+        if mapping is None:
+            yield from given.values()
+            return
+        root = self._content(mapping, "", SSM, "ParameterMapping", name)
+        for entry in root.iterfind(f"{SSM}MappingEntry"):
+            source, target = entry.get("source", ""), entry.get("target", "")
+            if prefix + source in given:
+                parameter = given[prefix + source]
+                converts = entry.get("suppressUnitConversion") not in TRUE
+                what = f"'{self._path}': the mapping of '{source}'"
+                yield parameter._replace(name=target, converts=converts, map=transformation(entry, what))
+
+    def _content(self, xml: ET.Element, inside: str, namespace: str, kind: str, name: str) -> ET.Element:
+        """Return the root of a set or mapping, which is inline or a file."""
+        inline = (xml.find(inside) if inside else xml) if not xml.get("source") else None
+        root = None if inline is None else next((c for c in inline if c.tag.startswith(namespace)), None)
+        if root is not None:
+            return self._checked(ET.tostring(root), f"an inline set of '{name}'", kind)
+        if xml.get("sourceBase", "SSD") != "SSD":
+            raise FmuError(f"'{self._path}': '{name}' has a parameter file inside its FMU: not supported")
+        return self.xml(self._member(xml.get("source", ""), name or "the system"), kind)
+
+
+def _units(xml: ET.Element | None) -> dict[str, Unit]:
+    """Return the units of a file by name."""
+    units = {}
+    for unit in [] if xml is None else xml.iterfind(f"{SSC}Unit"):
+        base, name = unit.find(f"{SSC}BaseUnit"), unit.get("name", "")
+        if base is not None:
+            exponents = tuple(int(base.get(key, "0")) for key in EXPONENTS)
+            units[name] = Unit(name, exponents, float(base.get("factor", "1")), float(base.get("offset", "0")))
+    return units
+
+
+def transformation(xml: ET.Element, what: str) -> Affine:
+    """Return the linear transformation of a connection or mapping entry.
+
+    Raises:
+        FmuError: it has another one, or one that is not finite.
+    """
+    for child in xml:
+        if child.tag.startswith(SSC) and child.tag.endswith("Transformation"):
+            if child.tag != f"{SSC}LinearTransformation":
+                raise FmuError(f"{what} has a {child.tag.removeprefix(SSC)}: not supported")
+            affine = Affine(float(child.get("factor", "1")), float(child.get("offset", "0")))
+            if not all(map(math.isfinite, affine)):
+                raise FmuError(f"{what} has a transformation that is not finite")
+            return affine
+    return IDENTITY

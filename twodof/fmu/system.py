@@ -1,0 +1,216 @@
+"""A system of FMUs in an SSP 1.0 file, with the interface of one FMU: that of the robot in it."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ..bounds import MAX_DESCRIPTIONS
+from ..errors import FmuError, choice
+from ..export.package import has_member
+from .description import Fmu, Scalar, load_any_fmu, logged
+from .ssp_file import IDENTITY, STRUCTURE, Affine, Parameter, read_ssp
+from .validation import NUMBERS
+from .wiring import Link, Node, Wiring, order
+
+
+@dataclass(frozen=True, repr=False)
+class System(Fmu):
+    """A system of co-simulation FMUs, one of which is the robot.
+
+    ``variables`` has those of the robot by their own names, those of other components as "component.name", and
+    connectors of the system by theirs. A variable that a connection drives is of causality "local".
+
+    Attributes:
+        title: the system's name.
+        digest: SHA-256 of its structure and its FMUs' digests.
+        components: FMUs by full name.
+        links: connections of components' variables with their first sources.
+        batches: outputs and inputs in the order in which their values are known at one instant.
+        places: component's variable, or connector of a system, that each of ``variables`` is.
+        bound: start values of components' variables by parameter bindings.
+    """
+
+    title: str = ""
+    digest: str = ""
+    components: Mapping[str, Fmu] = field(default_factory=dict)
+    links: tuple[Link, ...] = ()
+    batches: tuple[tuple[Node, ...], ...] = ()
+    places: Mapping[str, Node] = field(default_factory=dict)
+    bound: Mapping[Node, float | bool] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"<System '{self.path}': {', '.join(self.components)}; joints {', '.join(self.joints)}>"
+
+    @property
+    def name(self) -> str:
+        """The system's name."""
+        return self.title
+
+    @property
+    def guid(self) -> str:
+        """Digest of the structure and of the FMUs' digests."""
+        return self.digest
+
+    @property
+    def connections(self) -> list[str]:
+        """Texts of the connections, elements of vectors together, as "plant.q -> controller.q"."""
+        groups: dict[tuple[str, str, Affine], int] = {}
+        for link in self.links:
+            source, target = (str(node).partition("[")[0] for node in link[:2])
+            groups[source, target, link.map] = groups.get((source, target, link.map), 0) + 1
+        return [
+            f"{source} -> {target}"
+            + f", {count} values" * (count > 1)
+            + f", × {affine.gain:g} + {affine.offset:g}" * (affine != IDENTITY)
+            for (source, target, affine), count in groups.items()
+        ]
+
+
+def load_fmu(path: str | Path, robot: str = "") -> Fmu:
+    """Read and check an FMU's description, or a system of FMUs, without unzipping or running it.
+
+    Args:
+        path: an FMU, or an SSP 1.0 file.
+        robot: component of a system whose q and v are the robot's; "": the only one that has such.
+
+    Raises:
+        FmuError: the file is missing, no zip, not FMI 2.0 or 3.0 co-simulation or SSP 1.0, unsafe to unzip, or
+            has no outputs q[i] and v[i].
+    """
+    path = Path(path)
+    if has_member(path, STRUCTURE):
+        return load_system(path, robot)
+    if robot:
+        raise FmuError(f"'{path}' is no system of which `robot` '{robot}' could be a component")
+    return logged(load_any_fmu(path))
+
+
+def load_system(path: Path, robot: str = "") -> System:
+    """Read a system of FMUs.
+
+    Raises:
+        FmuError: naming the feature, component or connection that is at fault.
+    """
+    title, top, times, structure = read_ssp(path)
+    fmus: dict[str, Fmu] = {}
+    by_source: dict[str, Fmu] = {}
+    room = MAX_DESCRIPTIONS
+    for element in top.walk():
+        if element.source and element.source not in by_source:
+            by_source[element.source] = fmu = load_any_fmu(path, element.source)
+            room -= fmu.described
+            if room < 0:
+                raise FmuError(f"'{path}': the descriptions of its FMUs are larger than {MAX_DESCRIPTIONS} bytes")
+        if element.source:
+            fmus[element.name] = by_source[element.source]
+    wiring = Wiring(path, top, fmus)
+    links = wiring.links()
+    batches = order(path, fmus, links)
+    chosen = _robot(path, fmus, robot)
+    starts = _bound(path, wiring)
+    variables, places = _variables(path, wiring, fmus, links, starts, chosen)
+    digest = hashlib.sha256(structure)
+    for fmu in by_source.values():
+        digest.update(fmu.guid.encode() + b"\0")
+    own: dict[str, Any] = {each.name: getattr(fmus[chosen], each.name) for each in fields(Fmu)}
+    description = copy(fmus[chosen].description)
+    description.defaultExperiment = times
+    own |= dict(variables=variables, description=description, control="", prefix=f"{chosen}.")
+    return System(
+        **own,
+        title=title,
+        digest=digest.hexdigest(),
+        components=fmus,
+        links=tuple(links),
+        batches=tuple(map(tuple, batches)),
+        places=places,
+        bound={node: value for node, value in starts.items() if node.element in fmus},
+    )
+
+
+def _robot(path: Path, fmus: dict[str, Fmu], robot: str) -> str:
+    """Return the name of the component that is the robot; its joints are named."""
+    if robot and robot not in fmus:
+        raise FmuError(f"'{path}' has no component '{robot}'{choice(robot, fmus)}")
+    having = [name for name, fmu in fmus.items() if fmu.vector("q") and fmu.vector("v")] if not robot else [robot]
+    robots = [name for name in having if fmus[name].variables[fmus[name].vector("q")[0]].causality == "output"]
+    if len(robots) != 1:
+        some = f"; give one as `robot`: {', '.join(robots)}" if robots else f" among {', '.join(fmus)}"
+        raise FmuError(f"'{path}' has {len(robots) or 'no'} components with outputs q[i] and v[i]{some}")
+    fmus[robots[0]] = logged(fmus[robots[0]])
+    return robots[0]
+
+
+def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
+    """Return start values that parameter bindings give, those of outer systems before those of inner ones."""
+    starts: dict[Node, float | bool] = {}
+    for element in wiring.elements.values():
+        for parameter in element.parameters:
+            node = wiring.find(f"{element.name}.{parameter.name}" if element.name else parameter.name)
+            if node is not None:  # the standard ignores others
+                starts[node] = _value(path, wiring, node, parameter)
+    return starts
+
+
+def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> float | bool:
+    """Return the value of a parameter for a variable or connector, in its unit and of its type."""
+    value, scalar, total = parameter.value, wiring.scalar(node), parameter.map
+    if parameter.converts:
+        total = total.after(wiring.conversion(parameter.unit, wiring.unit(node), f"'{node}' and its value"))
+    kind = "Real" if scalar is None else scalar.type
+    truth = isinstance(value, bool)
+    result = value if truth else total.of(value)
+    if scalar is not None and (truth != (kind == "Boolean") or kind not in NUMBERS):
+        raise FmuError(f"'{path}': the value of '{node}', {value}, is not of type {kind}")
+    if not math.isfinite(result) or (kind == "Integer" and result != int(result)):
+        raise FmuError(f"'{path}': the value of '{node}', {result}, is not finite, or no whole number")
+    return int(result) if kind == "Integer" else result
+
+
+def _variables(
+    path: Path,
+    wiring: Wiring,
+    fmus: Mapping[str, Fmu],
+    links: list[Link],
+    starts: Mapping[Node, float | bool],
+    robot: str,
+) -> tuple[dict[str, Scalar], dict[str, Node]]:
+    """Return the variables of a system, those of its robot by their own names, and what each of them is."""
+    variables: dict[str, Scalar] = {}
+    places: dict[str, Node] = {}
+
+    def add(name: str, node: Node, scalar: Scalar, causality: str, start: float | bool | None) -> None:
+        if name in variables:
+            raise FmuError(f"'{path}' has two variables '{name}', '{node}' and '{places[name]}'")
+        text = None if start is None else str(start).lower() if isinstance(start, bool) else repr(start)
+        variables[name] = replace(scalar, name=name, causality=causality, start=text)
+        places[name] = node
+
+    driven: dict[Node, list[Link]] = {}
+    for link in links:
+        driven.setdefault(link.source, []).append(link)
+    for source, targets in driven.items():
+        if source.element in fmus:
+            continue
+        scalars = [scalar for link in targets if (scalar := wiring.scalar(link.target)) is not None]
+        first, link = scalars[0], targets[0]
+        causality = "input" if any(scalar.causality == "input" for scalar in scalars) else "parameter"
+        default = starts.get(link.target, first.start_value)
+        start = starts.get(source, default if default is None else link.map.inverse(default))
+        add(str(source), source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
+    ends = {link.target for link in links}
+    for element in (robot, *(name for name in fmus if name != robot)):
+        for scalar in fmus[element].variables.values():
+            node = Node(element, scalar.name)
+            if scalar.causality in ("input", "output", "parameter"):
+                own = element == robot and scalar.name not in variables
+                start = starts.get(node, scalar.start_value)
+                causality = "local" if node in ends else scalar.causality
+                add(scalar.name if own else str(node), node, scalar, causality, start)
+    return variables, places

@@ -1,0 +1,216 @@
+"""Run the FMUs of a system together, with the interface of an instance of one FMU.
+
+    at each communication point t_k, in the order of direct feedthrough:
+        outputs y(t_k) of each FMU; inputs u(t_k) = gain · y(t_k) + offset of the FMUs that they are connected to
+    then each FMU steps from t_k to t_(k+1) with its inputs held
+
+So a signal that passes through an FMU without delay has none, and the order of FMUs has no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+
+import fmpy
+
+from ..errors import FmuError, SimulationError
+from ..export.python_wrapper import check_python_wrapper
+from ..files import temporary_folder
+from .description import Fmu, opened
+from .instance import Instance, Instance3, Values
+from .ssp_file import IDENTITY
+from .system import System
+from .wiring import Link, Node
+
+READ = ("documentation/", "sources/")
+"""Folders of an FMU that no library looks into."""
+
+
+class SystemInstance:
+    """Instances of the FMUs of a system, that step together; its methods are those of ``Instance``."""
+
+    def __init__(self, system: System, instances: Mapping[str, Instance]) -> None:
+        self._system, self._instances = system, instances
+        self._outer: dict[Node, list[Link]] = {}
+        for link in system.links:
+            if link.source.element not in instances:
+                self._outer.setdefault(link.source, []).append(link)
+        self._signals: list[float | bool] = []
+        self._places: dict[Node, int] = {}
+        self._moves = [move for batch in system.batches for move in self._moves_of(batch)]
+        self._due = True
+
+    def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
+        """Set start values and pass initialisation mode, all FMUs together."""
+        every = {name: self._system.start_values[name] for name in self._outer_names()}
+        own = self._by_component({**every, **values})
+        for name, instance in self._instances.items():
+            bound = {node.connector: v for node, v in self._system.bound.items() if node.element == name}
+            with _named(name):
+                instance.begin(start_time, stop_time, {**bound, **own.get(name, {})})
+        self._propagate()
+        for name, instance in self._instances.items():
+            with _named(name):
+                instance.start()
+        self._propagate()
+
+    def _outer_names(self) -> list[str]:
+        starts = self._system.start_values
+        return [name for name, node in self._system.places.items() if node in self._outer and name in starts]
+
+    def reset(self) -> None:
+        """Reset to the state after instantiation."""
+        for name, instance in self._instances.items():
+            with _named(name):
+                instance.reset()
+
+    def set(self, values: Mapping[str, float | bool]) -> None:
+        """Set variables and connectors of the system by name."""
+        for name, own in self._by_component(values).items():
+            with _named(name):
+                self._instances[name].set(own)
+        self._due = True
+
+    def _by_component(self, values: Mapping[str, float | bool]) -> dict[str, dict[str, float | bool]]:
+        """Return values by component and the variable's name there, those of connectors through their connections."""
+        own: dict[str, dict[str, float | bool]] = {}
+        for name, value in values.items():
+            node = self._system.places[name]
+            ends = [(link.target, link.map) for link in self._outer.get(node, [])] or [(node, IDENTITY)]
+            for target, affine in ends:
+                own.setdefault(target.element, {})[target.connector] = affine.of(value)
+        return own
+
+    def step(self, t: float, h: float) -> None:
+        """Do one communication step of all FMUs from t to t + h."""
+        if self._due:
+            self._propagate()
+        name = ""
+        try:
+            for name in self._instances:
+                self._instances[name].step(t, h)
+        except SimulationError as error:
+            raise SimulationError(f"'{name}': {error}", outcome=error.outcome) from error
+        self._propagate()
+
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """Return a function that reads Real variables of the robot, always into the same buffer."""
+        nodes = [self._system.places[name] for name in names]
+        (element,) = {node.element for node in nodes}
+        return self._instances[element].reader([node.connector for node in nodes])
+
+    def _propagate(self) -> None:
+        """Pass the outputs of this instant to the inputs."""
+        name = ""
+        try:
+            for move in self._moves:
+                name, pass_on = move
+                pass_on()
+        except SimulationError as error:
+            raise SimulationError(f"'{name}': {error}", outcome=error.outcome) from error
+        self._due = False
+
+    def _moves_of(self, batch: Sequence[Node]) -> Iterator[tuple[str, Callable[[], object]]]:
+        """Yield components and functions that read outputs of a batch, or set inputs from outputs of earlier ones."""
+        incoming = {link.target: link for link in self._system.links}
+        for element, instance in self._instances.items():
+            own = [node for node in batch if node.element == element]
+            variables = self._system.components[element].variables
+            reals = [node for node in own if variables[node.connector].type == "Real"]
+            sinks = [incoming[node] for node in reals if node in incoming]
+            if sources := [node for node in reals if node not in incoming]:
+                yield element, self._read(instance.reader([node.connector for node in sources]), sources)
+            if sinks:
+                yield element, self._write(instance.writer([link.target.connector for link in sinks]), sinks)
+            for node in (node for node in own if node not in reals):
+                if node in incoming:
+                    yield element, partial(self._set_one, instance, node.connector, self._places[incoming[node].source])
+                else:
+                    self._places[node] = len(self._signals)
+                    self._signals.append(0)
+                    yield element, partial(self._read_one, instance, node.connector, self._places[node])
+
+    def _read(self, read: Callable[[], Values], sources: Sequence[Node]) -> Callable[[], None]:
+        """Return a function that reads outputs into signals."""
+        first, last = len(self._signals), len(self._signals) + len(sources)
+        self._places |= {node: first + i for i, node in enumerate(sources)}
+        self._signals += [0.0] * len(sources)
+        signals = self._signals
+
+        def move() -> None:
+            signals[first:last] = read()
+
+        return move
+
+    def _write(self, write: Callable[[list[float]], None], sinks: Sequence[Link]) -> Callable[[], None]:
+        """Return a function that sets inputs from signals."""
+        signals, columns = self._signals, [self._places[link.source] for link in sinks]
+        if all(link.map == IDENTITY for link in sinks):
+            return lambda: write([signals[column] for column in columns])
+        rows = [(*link.map, column) for link, column in zip(sinks, columns)]
+        return lambda: write([gain * signals[column] + offset for gain, offset, column in rows])
+
+    def _read_one(self, instance: Instance, name: str, place: int) -> None:
+        self._signals[place] = instance.value(name)
+
+    def _set_one(self, instance: Instance, name: str, place: int) -> None:
+        instance.set({name: self._signals[place]})
+
+
+@contextmanager
+def instantiate_fmu(fmu: Fmu) -> Iterator[Instance]:
+    """Instantiate an FMU from a temporary folder, and free the instance at the end.
+
+    It is unzipped into a temporary folder, but for what is there to be read by people.
+
+    An FmuError says that it has no binary for this platform, or cannot be unzipped or loaded.
+    """
+    if fmu.platform not in fmu.platforms:
+        here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
+        there = ", ".join(fmu.platforms) or "none"
+        remedy = "" if fmu.platform else "; build one with `native` and `fmi` 3"
+        reason = f"has no binary for this platform ({here}), only for: {there}{remedy}"
+        raise FmuError(f"'{fmu.path}' {reason}")
+    with temporary_folder() as folder:
+        with opened(fmu) as archive:
+            names = archive.namelist()
+            archive.extractall(folder, [name for name in names if not name.startswith(READ)])
+        library = folder / "binaries" / fmu.platform / fmu.library
+        check_python_wrapper(fmu.path, library, folder)
+        instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder)
+        try:
+            yield instance
+        finally:
+            instance.free()
+
+
+@contextmanager
+def instantiate(fmu: Fmu) -> Iterator[Instance | SystemInstance]:
+    """Instantiate an FMU, or those of a system, from temporary folders, and free the instances at the end.
+
+    Raises:
+        FmuError: one has no binary for this platform, or cannot be unzipped or loaded.
+    """
+    if not isinstance(fmu, System):
+        with instantiate_fmu(fmu) as instance:
+            yield instance
+        return
+    with ExitStack() as stack:
+        parts = {}
+        for name, part in fmu.components.items():
+            with _named(name):
+                parts[name] = stack.enter_context(instantiate_fmu(part))
+        yield SystemInstance(fmu, parts)
+
+
+@contextmanager
+def _named(component: str) -> Iterator[None]:
+    """Name the component in errors."""
+    try:
+        yield
+    except SimulationError as error:
+        raise SimulationError(f"'{component}': {error}", outcome=error.outcome) from error
+    except FmuError as error:
+        raise FmuError(f"'{component}': {error}") from error

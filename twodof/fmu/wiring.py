@@ -1,0 +1,225 @@
+"""Connections of a system: from the outputs of FMUs to inputs, through nested systems, in the order of feedthrough."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import NamedTuple
+
+from ..errors import FmuError, choice
+from .description import Fmu, Scalar
+from .ssp_file import EXPONENTS, IDENTITY, Affine, Connector, Element, Unit, transformation
+from .validation import TRUE
+
+SOURCES = ("output", "calculatedParameter")
+
+
+class Node(NamedTuple):
+    """A connector: the full name of its system or component, "" for the top system, and its own name."""
+
+    element: str
+    connector: str
+
+    def __str__(self) -> str:
+        return f"{self.element}.{self.connector}" if self.element else self.connector
+
+
+class Link(NamedTuple):
+    """A connection from its first source, a component's output or a system's connector, to a component's variable."""
+
+    source: Node
+    target: Node
+    map: Affine
+
+
+class Wiring:
+    """Elements of a system by full name, their variables and units, and what connects them.
+
+    Args:
+        path: for messages.
+        top: the top system.
+        fmus: of the components, by full name.
+    """
+
+    def __init__(self, path: object, top: Element, fmus: Mapping[str, Fmu]) -> None:
+        self._path, self._fmus = path, fmus
+        self.elements = {element.name: element for element in top.walk()}
+        self._units = {name: _units_of(fmu) for name, fmu in fmus.items()}
+        self._incoming: dict[Node, tuple[Node, bool, Affine]] = {}
+        for element in self.elements.values():
+            for connection in element.connections:
+                self._connect(element, connection)
+
+    def scalar(self, node: Node) -> Scalar | None:
+        """Return a component's variable; None of a system's connector.
+
+        Raises:
+            FmuError: the component has no such variable.
+        """
+        if (fmu := self._fmus.get(node.element)) is None:
+            return None
+        if node.connector not in fmu.variables:
+            raise FmuError(f"'{self._path}': there is no '{node!s:.80}'{choice(node.connector, fmu.variables)}")
+        return fmu.variables[node.connector]
+
+    def find(self, name: str) -> Node | None:
+        """Return the variable or connector of a full name; None where there is none."""
+        for element in [*self.elements][::-1]:  # the innermost comes last
+            own = name.removeprefix(f"{element}.") if element else name
+            named = self._fmus[element].variables if element in self._fmus else self.elements[element].connectors
+            if own in named and (own != name or not element):
+                return Node(element, own)
+        return None
+
+    def unit(self, node: Node) -> Unit:
+        """Return the unit of a connector, else that of its variable."""
+        stated = self.elements[node.element].connectors.get(node.connector, Connector("", Unit())).unit
+        scalar = self.scalar(node)
+        own = (scalar.unit or "") if scalar is not None else ""
+        name = stated.name or own
+        known = self._units.get(node.element, {})
+        return stated if stated.exponents is not None else known.get(name, Unit(name))
+
+    def _kind(self, node: Node) -> str:
+        scalar = self.scalar(node)
+        if scalar is not None:
+            return scalar.causality
+        connectors = self.elements[node.element].connectors
+        if node.connector not in connectors:
+            raise FmuError(f"'{self._path}': there is no connector '{node}'{choice(node.connector, connectors)}")
+        return connectors[node.connector].kind
+
+    def _connect(self, system: Element, connection: Mapping[str, str] | object) -> None:
+        """Take over a connection inside a system, whose start may be its sink."""
+        get = connection.get  # type: ignore[union-attr]
+        ends = []
+        for end in ("start", "end"):
+            inner = get(f"{end}Element")
+            name = system.name if not inner else f"{system.name}.{inner}" if system.name else inner
+            if name not in self.elements:
+                raise FmuError(f"'{self._path}': a connection names '{inner:.80}', which is no element")
+            node = Node(name, get(f"{end}Connector", ""))
+            gives = (self._kind(node) in SOURCES) == bool(inner)
+            ends.append((node, gives))
+        (start, start_gives), (sink, sink_gives) = ends
+        what = f"'{self._path}': the connection of '{start}' and '{sink}'"
+        affine = transformation(connection, what)  # type: ignore[arg-type]
+        if start_gives == sink_gives or (sink_gives and affine != IDENTITY):
+            raise FmuError(f"{what} is not from an output to an input")
+        if sink_gives:
+            start, sink = sink, start
+        if sink in self._incoming:
+            raise FmuError(f"'{self._path}': two connections end at '{sink}'; leave one out")
+        self._incoming[sink] = start, get("suppressUnitConversion") not in TRUE, affine
+
+    def links(self) -> list[Link]:
+        """Return the connections of components' variables with their first sources.
+
+        Raises:
+            FmuError: a connection comes back to itself, or connects different types or units.
+        """
+        found = []
+        for target in self._incoming:
+            if target.element not in self._fmus:
+                continue
+            way = [target]
+            while way[-1] in self._incoming:
+                source = self._incoming[way[-1]][0]
+                if source in way:
+                    raise FmuError(f"'{self._path}': the connections to '{target}' are a circle of systems")
+                way.append(source)
+                if source.element in self._fmus:
+                    break
+            found.append(Link(way[-1], target, self._map(way[::-1])))
+        return found
+
+    def _map(self, way: list[Node]) -> Affine:
+        """Return the map of values along a way, with conversions of units."""
+        total, unit = IDENTITY, self.unit(way[0])
+        for node in way[1:]:
+            start, converts, affine = self._incoming[node]
+            own = self.unit(node)
+            if converts:
+                total = self.conversion(unit, own, f"'{start}' and '{node}'").after(total)
+            total, unit = affine.after(total), own if own.name else unit
+        source, target = self.scalar(way[0]), self.scalar(way[-1])
+        assert target is not None
+        if target.type not in ("Real", "Integer", "Boolean") or (source is not None and source.type != target.type):
+            types = target.type if source is None else f"{source.type} and {target.type}"
+            raise FmuError(f"'{self._path}': '{way[0]}' and '{way[-1]}' are of type {types}: not supported")
+        if target.causality not in ("input", "parameter") or (source is not None and target.causality == "parameter"):
+            raise FmuError(f"'{self._path}': '{way[-1]}' is of causality {target.causality}: not supported")
+        if target.type != "Real" and total != IDENTITY:
+            raise FmuError(f"'{self._path}': '{way[-1]}' is of type {target.type}, which is not transformed")
+        return total
+
+    def conversion(self, source: Unit, target: Unit, what: str) -> Affine:
+        """Return the conversion between units, none where one of them is not stated.
+
+        Raises:
+            FmuError: they differ in dimension, or are not defined.
+        """
+        if not source.name or not target.name or source == target:
+            return IDENTITY
+        if source.exponents is None or target.exponents is None:
+            if source.name == target.name:
+                return IDENTITY
+            raise FmuError(
+                f"'{self._path}': {what} have the units '{source.name}' and '{target.name}', of which one"
+                " is not defined"
+            )
+        if source.exponents != target.exponents:
+            raise FmuError(
+                f"'{self._path}': {what} have units of different dimensions, '{source.name}' and '{target.name}'"
+            )
+        if not (target.factor and math.isfinite(source.factor / target.factor)):
+            raise FmuError(f"'{self._path}': the unit '{target.name}' of {what} has no valid factor")
+        return Affine(source.factor / target.factor, (source.offset - target.offset) / target.factor)
+
+
+def _units_of(fmu: Fmu) -> dict[str, Unit]:
+    units = {}
+    for unit in fmu.description.unitDefinitions:
+        if (base := unit.baseUnit) is not None:
+            exponents = tuple(int(getattr(base, key) or 0) for key in EXPONENTS)
+            factor, offset = (float(1.0 if x is None else x) for x in (base.factor, base.offset))
+            units[unit.name] = Unit(unit.name, exponents, factor, offset)
+    return units
+
+
+def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[list[Node]]:
+    """Return batches of outputs and inputs in the order in which their values are known at one instant.
+
+    An output follows the connected inputs on which it depends directly, by its FMU's ModelStructure; on all of them
+    where that does not say.
+
+    Raises:
+        FmuError: there is an algebraic loop; naming it.
+    """
+    between = [link for link in links if link.source.element in fmus]
+    inputs: dict[str, list[Node]] = {}
+    for link in between:
+        inputs.setdefault(link.target.element, []).append(link.target)
+    graph: dict[Node, list[Node]] = {link.target: [link.source] for link in between}
+    for source in dict.fromkeys(link.source for link in between):
+        fmu = fmus[source.element]
+        known = {u.variable.valueReference: u.dependencies for u in fmu.description.outputs}
+        needed = known.get(fmu.variables[source.connector].reference)
+        references = None if needed is None else {variable.valueReference for variable in needed}
+        graph[source] = [
+            node
+            for node in inputs.get(source.element, [])
+            if references is None or fmu.variables[node.connector].reference in references
+        ]
+    sorter, batches = TopologicalSorter(graph), []
+    try:
+        sorter.prepare()
+    except CycleError as error:
+        loop = " -> ".join(str(node) for node in error.args[1])
+        remedy = "an FMU in it has to delay its output, as one with a control_period or a state does"
+        raise FmuError(f"'{path}' has an algebraic loop: {loop}; {remedy}") from error
+    while sorter.is_active():
+        batches.append([*sorter.get_ready()])
+        sorter.done(*batches[-1])
+    return batches
