@@ -282,7 +282,7 @@ class Instance:
             raise SimulationError(self._said)
 
     def log(self, status: int, _category: bytes, text: bytes) -> None:
-        """Log a message of the FMU, and keep that of an error for the exception to come."""
+        """Pass a message of the FMU to the logger, and store that of an error for the exception to come."""
         message = text.decode("utf-8", "replace").strip()
         if status > WARNING:
             self._said = message
