@@ -78,7 +78,7 @@ def test_a_run_of_another_control_is_not_replayed(
     twodof.simulate(native_path, twodof.Bag(tmp_path / "first"), stop_time=0.1)
     command = ["run", str(effort), "--input", str(tmp_path / "first"), "-o", str(tmp_path / "a")]
     assert main(command) == 1
-    assert "no variable 'x_des[1]': it is of control 'task' or" in capfd.readouterr().err
+    assert "no variable 'x_des[1]': it belongs to control 'task' or" in capfd.readouterr().err
     assert not (tmp_path / "a").exists()
 
 

@@ -214,7 +214,7 @@ def test_what_the_fmu_refuses_is_one_line_and_leaves_no_bag(folder: Path) -> Non
 
 def test_controls_are_told_in_the_words_of_the_options(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--set", "quat_des=1"]) == 1
-    told = "it is of control 'task --orientation'; this FMU has control 'task'\n"
+    told = "it belongs to control 'task --orientation'; this FMU has control 'task'\n"
     assert capfd.readouterr().err.endswith(told)
     for command in (["build", "--orientation", "-o", "six.fmu"], ["info", "six.fmu"]):
         assert main(command) == 0

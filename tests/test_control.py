@@ -322,7 +322,7 @@ def test_the_description_is_that_of_the_control(fmus, control):
 
 
 def test_a_variable_of_another_control_is_named_as_such(fmus):
-    message = "no variable 'x_des': it is of control 'task' or control 'pose'; this FMU has control"
+    message = "no variable 'x_des': it belongs to control 'task' or control 'pose'; this FMU has control"
     with pytest.raises(twodof.TwoDofError, match=f"{message} 'effort'"):
         twodof.experiment(fmus["effort", True], settings={"x_des": 1.0})
     assert twodof.load_fmu(fmus["joint", False]).control == "joint"

@@ -159,7 +159,7 @@ def test_folder_that_goes_under_the_run_ends_it(native_path: Path, tmp_path: Pat
     _, err = process.communicate(timeout=120)
     assert process.returncode == 1
     (line,) = err.splitlines()
-    assert line.startswith(f"twodof: error: cannot go on writing the bag '{bag}': it was removed")
+    assert line.startswith(f"twodof: error: cannot continue writing the bag '{bag}': it was removed")
     assert not bag.exists()
     if how == "moved":
         assert main(["recover", str(tmp_path / "moved")]) == 0

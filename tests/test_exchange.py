@@ -480,7 +480,7 @@ def test_what_is_out_of_turn_or_wrong_is_refused_and_changes_nothing(fmus):
     step = (model.component, ctypes.c_double(0.0), ctypes.c_double(0.01), 0)
     assert model.dll["fmi2DoStep"](ctypes.c_void_p(step[0]), *step[1:]) == ERROR
     assert "fmi2DoStep is a call of co-simulation" in model.messages.pop()[1]
-    model.refused("wrong number of values, 4 are wanted", "getDerivatives", four, 3)
+    model.refused("wrong number of values, expected 4", "getDerivatives", four, 3)
     model.refused(r"der\(q\[1\]\) is computed and cannot be set", "setReal", [model.vr["der(q[1])"]], [0])
     model.go()
     model.refused("is not allowed in the state 'continuous-time mode'", "newDiscreteStates")

@@ -119,7 +119,7 @@ def test_its_bag_and_what_is_said_of_it(oscillators, tmp_path, capsys):
     for refused, reason in (
         (["page", str(oscillators), "-o", str(tmp_path / "a.html")], "has no plant in C"),
         (["linearise", str(oscillators)], "gives no derivatives"),
-        (["live", str(oscillators), "--no-browser"], "carries no robot"),
+        (["live", str(oscillators), "--no-browser"], "contains no robot"),
     ):
         assert main(refused) == 1
         message = capsys.readouterr().err

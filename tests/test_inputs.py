@@ -162,7 +162,7 @@ BAD_TABLES = {
     "infinite": ("time,Kn\n0,1\n1,inf\n", "row 3: Kn = inf is not finite"),
     "NaN time": ("time,Kn\nnan,1\n", "row 2: time = nan is not finite"),
     "unknown column": ("time,Kq\n0,1\n", "no variable 'Kq'; did you mean 'K"),
-    "column of another control": ("time,tau_cmd\n0,1\n", "it is of control 'effort'; this FMU has"),
+    "column of another control": ("time,tau_cmd\n0,1\n", "it belongs to control 'effort'; this FMU has"),
     "column without a name": ("time,\n0,1\n", "no variable ''"),
     "no number": ("time,Kn\n0,high\n", "row 2: Kn = 'high' is not a number"),
     "empty cell": ("time,Kn\n0,\n", "row 2: Kn = '' is not a number"),

@@ -66,7 +66,7 @@ def test_an_equilibrium_holds_still(bare):
     [
         ("bare", {"q": [0.0, np.pi]}, "joint 'joint2' is at its limit 3.14159"),
         ("bare", {"tau_cmd": 90.0}, "there is no equilibrium near q_start = "),
-        ("bare", {"Kp": 1.0}, "it is of control 'task' or "),
+        ("bare", {"Kp": 1.0}, "it belongs to control 'task' or "),
         ("task", {"q": [0.3, 0.8], "rcond": "ratio"}, "jumps here"),
         ("python", {}, "gives no derivatives; a native FMU does"),
     ],
@@ -168,7 +168,7 @@ def test_half_a_turn_from_the_target_is_refused(ur10):
         target = pin.Quaternion(pin.AngleAxis(angle, np.array([0.6, 0.0, 0.8]))) * rotation
         return {"q": q, "quat_des": (3.0 * target.coeffs()).tolist()}
 
-    with pytest.raises(twodof.TwoDofError, match="half a turn from quat_des, where the way back jumps"):
+    with pytest.raises(twodof.TwoDofError, match="half a turn from quat_des, where the orientation error jumps"):
         twodof.linearise(ur10, away(np.pi))
     for angle in (np.pi - 1e-4, np.pi + 1e-4):
         assert np.isfinite(twodof.linearise(ur10, away(angle)).A).all()

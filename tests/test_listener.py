@@ -166,8 +166,8 @@ def test_a_controller_in_real_time_misses_nothing(
     ("topics", "command", "missing"),
     [
         ((), "", "nobody publishes on /joint_commands"),
-        (("/joint_commands=command",), "", "nobody hears /joint_states"),
-        (("/joint_commands=command", "/joint_states"), "", "who publishes on /joint_commands is silent"),
+        (("/joint_commands=command",), "", "nobody subscribes to /joint_states"),
+        (("/joint_commands=command", "/joint_states"), "", "the publisher on /joint_commands sends nothing"),
         (
             ("/joint_commands=command", "/joint_states"),
             "1 5000000007 joint1 - - 0.1",
@@ -406,9 +406,9 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
         (["--clock", "--state-topic", "/clock"], "'/clock' would be two topics"),
         (["--scene", "--state-topic", "tf"], "'/tf' would be two topics"),
         (["--clock", "--command-topic", "/pause"], "'/pause' would be two topics"),
-        (["--speed", "0"], "--speed 0 is no factor"),
-        (["--speed", "inf"], "--speed inf is no factor"),
-        (["--timeout", "-1"], "--timeout -1 is no time"),
+        (["--speed", "0"], "--speed 0 must be > 0"),
+        (["--speed", "inf"], "--speed inf must be > 0"),
+        (["--timeout", "-1"], "--timeout -1 must be > 0 s"),
         (["--on-timeout", "ramp"], "--on-timeout 'ramp' is for control 'effort'"),
         (["--rate", "0"], "--rate 0: not a number of steps a second"),
         (["--rate", "nan"], "--rate nan"),

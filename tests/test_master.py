@@ -240,10 +240,10 @@ def test_what_cannot_run_together_opens_no_sink(native_path, monkeypatch):
         ({**options, "stamp_start": 1.0}, InputError),
         ({**options, "settings": {"rtol": -1.0}}, SimulationError),
     ):
-        with pytest.raises(error, match=r"what runs together|rtol = -1 must be"):
+        with pytest.raises(error, match=r"runs in one loop|rtol = -1 must be"):
             simulate_together([first, Member(twodof.experiment(native_path, **other), [])])
     unstamped = Member(twodof.experiment(native_path, stop_time=0.1), [])
-    with pytest.raises(InputError, match="what runs together has one"):
+    with pytest.raises(InputError, match="runs in one loop need equal"):
         simulate_together([unstamped, unstamped])
 
 
@@ -372,7 +372,7 @@ def test_what_was_read_of_an_fmu_is_not_said_of_another(tmp_path, native_path, m
 @pytest.mark.parametrize("how", [twodof.samples, twodof.simulate])
 def test_options_beside_an_experiment_are_refused(native_path, how):
     run = twodof.experiment(native_path, stop_time=0.1)
-    with pytest.raises(InputError, match="settings, step beside an experiment would do nothing"):
+    with pytest.raises(InputError, match="settings, step would have no effect with an experiment"):
         list(how(run, settings={"Kp": 10.0}, step=0.1))
 
 

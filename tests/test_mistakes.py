@@ -85,7 +85,7 @@ MISTAKES: dict[str, str] = {
     f"{RUN} --set x_des=[0.2,0.1]": "is not a number; write numbers as",
     f"{RUN} --set limit_effort=yes": "'yes' is not a number; .* true or false",
     f"{RUN} --set q=1,1": r"q\[1\] is of causality 'output' .*; set q_start\[1\]",
-    f"{RUN} --set q_des=1,1": "'q_des': it is of control 'joint'",
+    f"{RUN} --set q_des=1,1": "'q_des': it belongs to control 'joint'",
     f"{RUN} --set x_des=1e30": r"a setting may be too large: x_des\[1\] = 1e\+30 m",
     f"{RUN} --step 0.015": "no whole number of steps of 0.015 s; take steps of 0.02 s, or end at 0.015 s",
     "run arm.fmu -o out --stop-time 5 --step 0.03": "steps of 0.0299401198 s, or end at 5.01 s",

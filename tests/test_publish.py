@@ -236,7 +236,7 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
     with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
         assert "end       after 0.5 s, or Ctrl-C\n" in process.told
         _, err = ended(process)
-    assert err.splitlines() == ["WARNING: there is no network interface: nobody can hear what is published"]
+    assert err.splitlines() == ["WARNING: there is no network interface: no other program can receive the run"]
     assert len(recorded(bag)["/joint_states"]) == 51
 
 
@@ -251,8 +251,8 @@ def packets(process: subprocess.Popen[str]) -> int:
 @pytest.mark.parametrize(
     ("options", "variables", "reach", "local", "outside"),
     [
-        ([], {}, "lo, cable0, range LOCALHOST (this host alone; --subnet opens it)", True, False),
-        ([], {"ROS_LOCALHOST_ONLY": "1"}, "lo, loopback alone (ROS_LOCALHOST_ONLY)", True, False),
+        ([], {}, "lo, cable0, range LOCALHOST (this host only; --subnet opens it)", True, False),
+        ([], {"ROS_LOCALHOST_ONLY": "1"}, "lo, loopback only (ROS_LOCALHOST_ONLY)", True, False),
         ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "cable0, range OFF (nobody)", False, False),
         (["--subnet"], {}, "cable0, range SUBNET (other hosts too)", True, True),
         (
@@ -471,7 +471,7 @@ def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
 
 def test_options_beside_an_experiment_are_refused(native_path: Path) -> None:
     run = twodof.experiment(native_path, stop_time=0.02)
-    with pytest.raises(InputError, match="stop_time beside an experiment would do nothing"):
+    with pytest.raises(InputError, match="stop_time would have no effect with an experiment"):
         twodof.publish(run, stop_time=1.0)
 
 

@@ -73,8 +73,8 @@ def other_host(process: subprocess.Popen[str]) -> Iterator[int]:
 @pytest.mark.parametrize(
     ("options", "variables", "said", "open_to"),
     [
-        ([], {}, "(this host alone; --subnet opens it)", False),
-        ([], {"ROS_LOCALHOST_ONLY": "1"}, "loopback alone (ROS_LOCALHOST_ONLY)", False),
+        ([], {}, "(this host only; --subnet opens it)", False),
+        ([], {"ROS_LOCALHOST_ONLY": "1"}, "loopback only (ROS_LOCALHOST_ONLY)", False),
         ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "(nobody)", False),
         ([], {"ROS_STATIC_PEERS": "10.200.0.3"}, "(this host and 10.200.0.3; --subnet opens it)", False),
         (

@@ -159,7 +159,7 @@ def test_a_urdf_of_several_ends_is_run_by_one_command_too(
     assert main(["page", "fork.urdf", "--frame", "tip", "-o", "fork.html"]) == 0
     for fmu, what in ((["fork-native.fmu"], "an FMU"), ([], "none")):
         assert main(["run", *fmu, "--frame", "tip", "-o", "none"]) != 0
-        refusal = f"--frame is of a URDF that is given; leave it out beside {what}"
+        refusal = f"--frame applies to a given URDF; leave it out with {what}"
         assert refusal in capsys.readouterr().err
 
 

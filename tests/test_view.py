@@ -306,7 +306,7 @@ def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(shown: Browser, folder: P
         assert set(rows(page)) == {"time", "sample", "joint1", "joint2"}
         status, _, errors = command.interrupt()
     assert status == 0
-    assert errors == "WARNING: 'foreign' carries no robot; give one with --urdf\n"
+    assert errors == "WARNING: 'foreign' contains no robot; give one with --urdf\n"
 
 
 class Done(NamedTuple):
@@ -457,7 +457,7 @@ def test_port_in_use(folder: Path, run_view: View) -> None:
         (["bag", "--urdf", "other.urdf"], "no joint 'shoulder'"),
         (["bag", "--fmu", "none.fmu"], "no FMU 'none.fmu'"),
         (["bag", "--mesh-dir", "."], "give that with --urdf"),
-        (["bag", "--urdf", "other.urdf", "--fmu", "none.fmu"], "leave it out beside --urdf"),
+        (["bag", "--urdf", "other.urdf", "--fmu", "none.fmu"], "leave it out with --urdf"),
         (["bag", "--host", "192.0.2.1"], "cannot listen on 192.0.2.1"),
         (["bag", "--host", "a" * 64], f"cannot listen on {'a' * 64}:0: "),
         (["bag", "--host", ""], "--host is empty; 0.0.0.0 is all addresses of this machine"),

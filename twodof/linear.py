@@ -253,7 +253,8 @@ class _Point:
             actual, target = (self._read(self._fmu.vector(name)) for name in ("quat", "quat_des"))
             if abs(actual @ (target / np.linalg.norm(target))) < NEAR_JUMP:
                 raise SimulationError(
-                    "the frame is half a turn from quat_des, where the way back jumps: choose another q or quat_des"
+                    "the frame is half a turn from quat_des, where the orientation error jumps:"
+                    " choose another q or quat_des"
                 )
         rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # the rows of the task Jacobian
         if "rcond" not in self._fmu.variables or not rows:

@@ -12,7 +12,7 @@ static Instance *enter_with(void *component, Call call, const void *values, size
     if (!instance)
         return NULL;
     if (count != wanted || (wanted > 0 && !values)) {
-        report(instance, ERROR, "%s: %s, %u are wanted", call_name(call),
+        report(instance, ERROR, "%s: %s, expected %u", call_name(call),
                values ? "wrong number of values" : "null pointer", (unsigned)wanted);
         return NULL;
     }

@@ -146,8 +146,7 @@ def _read(
     stating = [topic for topic, kind in counts if kind == JOINT_STATE]
     if len(stating) > 1 and chosen != prefix + JOINT_STATES:
         LOG.warning(
-            f"'{path}' has several topics of joint states, {', '.join(map(shown, stating))};"
-            f" what is read is {shown(chosen)}"
+            f"'{path}' has several topics of joint states, {', '.join(map(shown, stating))}; {shown(chosen)} is read"
         )
     if downsampler is not None and thinned:
         thin(downsampler)  # downsample the end like the rest

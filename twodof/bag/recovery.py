@@ -97,7 +97,7 @@ def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]
     if not between and not folder.is_dir():
         whole, _, robot = str(bag).rpartition(":")
         if whole and robot and Path(whole).is_dir():
-            raise BagError(f"there is no bag '{bag}'; 'twodof recover {whole}' is of all its robots")
+            raise BagError(f"there is no bag '{bag}'; 'twodof recover {whole}' repairs all its robots")
         raise BagError(no_such("bag", bag))
     held = lock(original if between else folder)
     try:

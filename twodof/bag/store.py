@@ -247,12 +247,12 @@ class Store:
             return failure
         gone = not self.path.exists()  # the storage's own error would be arbitrary
         reason = REMOVED if gone else _reason(failure)
-        reason = f"cannot go on writing the bag '{self.path}': {reason}"
+        reason = f"cannot continue writing the bag '{self.path}': {reason}"
         if self._closed:
             kept = min(part.stored() for part in self._parts)
             return BagError(f"{reason}; it is closed with its first {kept} samples")
         if not gone:
-            return BagError(f"{reason}; then make it whole with 'twodof recover {self.path}'")
+            return BagError(f"{reason}; then repair it with 'twodof recover {self.path}'")
         return BagError(reason)
 
 

@@ -19,10 +19,10 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
     of_urdf = is_robot(options.fmu)
     if options.frame is not None and not of_urdf:
         what = "an FMU" if options.fmu else "none"
-        raise CommandLineError(f"--frame is of a URDF that is given; leave it out beside {what}")
+        raise CommandLineError(f"--frame applies to a given URDF; leave it out with {what}")
     if options.fmu and not of_urdf:
         if options.native:
-            raise CommandLineError("--native builds the default arm's FMU; leave it out beside an FMU")
+            raise CommandLineError("--native builds the default arm's FMU; leave it out with an FMU")
         return Path(options.fmu)
     from ..export.compiler import host_platform
 

@@ -139,7 +139,7 @@ def check_company(
             raise CommandLineError(f"{option} does nothing without {other}")
     for option, other in (excludes or {}).items():
         if _given(options, option) and _given(options, other):
-            raise CommandLineError(f"{option} does nothing beside {other}; leave one out")
+            raise CommandLineError(f"{option} has no effect with {other}; leave one out")
 
 
 def _given(options: argparse.Namespace, option: str) -> bool:

@@ -119,7 +119,7 @@ def _of_another(fmu: Variables, name: str) -> str:
     if not fmu.control or not having:
         return ""
     quoted = " or ".join(f"control '{control}'" for control in having)
-    return f": it is of {quoted}; this FMU has control '{fmu.control}'"
+    return f": it belongs to {quoted}; this FMU has control '{fmu.control}'"
 
 
 def no_variable(fmu: Variables, name: str, *causalities: str) -> str:

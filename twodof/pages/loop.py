@@ -80,7 +80,7 @@ class Loop:
         fmu = run.fmu
         drives = [group for group in ("x_des", "q_des", "tau_cmd") if fmu.vector(group)]
         if fmu.urdf is None or not fmu.axes or not drives:
-            raise PageError(f"'{fmu.path}' carries no robot, or no inputs that drive it")
+            raise PageError(f"'{fmu.path}' contains no robot, or no inputs that drive it")
         self._run, self._bag, self._command_line = run, bag, command_line
         self._first = run
         self.recorded: list[Path] = []

@@ -69,13 +69,13 @@ def replay(
     if mesh_dir is not None and urdf is None:
         raise PageError("`mesh_dir` has the meshes of a URDF; give that with `urdf`")
     if fmu is not None and urdf is not None:
-        raise PageError("`fmu` has the meshes of the bag's robot; leave it out beside `urdf`")
+        raise PageError("`fmu` has the meshes of the bag's robot; leave it out with `urdf`")
     track = read_tracks([bag], urdf=urdf, frame=frame, most=MOST_SAMPLES)[0]
     remarks: list[str] = []
     shapes: Sequence[Shape] = []
     motion, text = track.motion, NO_ROBOT
     if motion is None:
-        remarks.append(f"'{track.recording.path}' carries no robot; give one with `urdf`")
+        remarks.append(f"'{track.recording.path}' contains no robot; give one with `urdf`")
     else:
         text, read = _robot(track.recording, urdf, mesh_dir, fmu, remarks)
         try:

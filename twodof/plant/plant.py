@@ -300,7 +300,7 @@ class Plant(ControlledPlant):
 
     def _check_target(self) -> None:
         if self.control == "pose" and not any(self.quat_des):
-            raise DiscardError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing")
+            raise DiscardError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) is no rotation")
 
     def _check_parameters(self) -> None:
         try:

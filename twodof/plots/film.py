@@ -57,7 +57,7 @@ def film(
     """
     path, track = Path(output), read_tracks([bag], urdf=urdf, frame=frame)[0]
     if track.motion is None:
-        raise PlotError(f"'{track.recording.path}' carries no robot; give one with `urdf`")
+        raise PlotError(f"'{track.recording.path}' contains no robot; give one with `urdf`")
     kind, end, content = path.suffix.lower(), float(track.t[-1]), io.BytesIO()
     if kind == ".png":
         shape = (round(SIZE[1] * DOTS), round(SIZE[0] * DOTS), 4)

@@ -147,9 +147,9 @@ class Messages:
         measured: bool = False,
     ) -> None:
         if effort and not run.fmu.vector("tau"):
-            raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
+            raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which `effort` records")
         if measured and not run.fmu.vector("q_meas"):
-            raise BagError(f"'{run.fmu.path}' has no outputs q_meas[i] and v_meas[i], which are what is measured")
+            raise BagError(f"'{run.fmu.path}' has no outputs q_meas[i] and v_meas[i], which `measured` records")
         self._scene = _load_scene(run, meshes_in) if scene else None
         self._axes = ["xyz".index(axis) for axis in run.fmu.axes]
         n, m, poses = len(run.fmu.joints), 0, False
@@ -249,7 +249,7 @@ class Messages:
 def _load_scene(run: Experiment, meshes_in: str) -> Scene:
     urdf = run.fmu.urdf
     if urdf is None or not run.fmu.axes:
-        raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which a scene shows")
+        raise BagError(f"'{run.fmu.path}' contains no robot.urdf, which a scene shows")
     from .scene import Scene  # SciPy takes half a second to import
 
     try:

@@ -66,8 +66,8 @@ class Network(NamedTuple):
     def reach(self) -> str:
         """Hosts that can receive, in words."""
         if self.loopback:
-            return "loopback alone (ROS_LOCALHOST_ONLY)"
-        hosts = f"this host and {', '.join(self.peers)}" if self.peers else "this host alone"
+            return "loopback only (ROS_LOCALHOST_ONLY)"
+        hosts = f"this host and {', '.join(self.peers)}" if self.peers else "this host only"
         words = {"LOCALHOST": f"{hosts}; `subnet=True` opens it", "OFF": "nobody"}
         return f"range {self.range} ({words.get(self.range, 'other hosts too')})"
 
@@ -226,7 +226,7 @@ def open_domain(network: Network) -> OpenDomain:
             opened, used, messages = _try_to_open(network, own)
     interfaces = ", ".join(used) or "an interface of CYCLONEDDS_URI"
     if opened is None and "failed to find interfaces" in messages:
-        LOG.warning("there is no network interface: nobody can hear what is published")
+        LOG.warning("there is no network interface: no other program can receive the run")
         interfaces = "no interface"
         opened = domain.Domain(network.domain, NO_NETWORK)
     elif opened is None:

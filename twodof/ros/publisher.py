@@ -80,7 +80,7 @@ class Publisher(Sink):
         if on_timeout not in (None, "hold", "ramp"):
             raise InputError(f"`on_timeout` '{on_timeout}' is not 'hold' or 'ramp'")
         if timeout is not None and not 0.0 < timeout < inf:
-            raise InputError(f"`timeout` {timeout:g} is no time")
+            raise InputError(f"`timeout` {timeout:g} must be > 0 s")
         self._opened = opened
         self._shared = network if isinstance(network, OpenDomain) else None
         self.network = network.network if isinstance(network, OpenDomain) else network or network_of_environment()
@@ -232,14 +232,14 @@ class Publisher(Sink):
         if not self._listener.is_matched(name):
             return f"nobody publishes on {name}"
         if not self._writers[JOINT_STATES].get_matched_subscriptions():
-            return f"nobody hears {self._named(JOINT_STATES)}"
-        return f"who publishes on {name} is silent"
+            return f"nobody subscribes to {self._named(JOINT_STATES)}"
+        return f"the publisher on {name} sends nothing"
 
     def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
         """Return start values to continue after a discarded step: commands must not end a run."""
         rest = at_rest(self._run.fmu, sample) if self.commands else None
         if rest is not None:
-            self._warn("rest", f"{error}: the robot is stopped, and its target is where it is")
+            self._warn("rest", f"{error}: the robot is stopped, and its target is set to its position")
         return rest
 
     def __exit__(self, *exception: object) -> None:

@@ -127,7 +127,7 @@ def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
     try:
         surfaces = meshes.surfaces(uri.removeprefix("package://"), coloured=False)
         if not surfaces:
-            raise ValueError("the FMU does not carry it")
+            raise ValueError("the FMU does not contain it")
         vertices = np.concatenate([surface.vertices for surface in surfaces]) * scale
         if np.abs(vertices).max(initial=0.0) < LARGEST:  # false also for NaN
             return vertices

@@ -39,7 +39,7 @@ def layouts(
         The files: .rviz, .xml for PlotJuggler, .json for Foxglove.
 
     Raises:
-        BagError: the FMU carries no robot.
+        BagError: the FMU contains no robot.
         FmuError: it cannot be read.
         InputError: the namespace is invalid, or a file exists with another content.
         OSError: a file cannot be written.

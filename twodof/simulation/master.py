@@ -142,7 +142,7 @@ def as_experiment(
         return experiment(run, **merged)
     if options:
         beside = ", ".join(options)
-        raise InputError(f"{beside} beside an experiment would do nothing; `experiment` takes them")
+        raise InputError(f"{beside} would have no effect with an experiment; give them to `experiment`")
     return run
 
 
@@ -285,7 +285,7 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
     times = {(run.start_time, run.step, run.steps, run.stamp_start) for run, *_ in members}
     start, stamp, ended = members[0].run.start_time, members[0].run.stamp_start, False
     if len(times) > 1 or (stamp is None and len(members) > 1):
-        raise InputError("what runs together has one start time, step, stop time and first stamp")
+        raise InputError("runs in one loop need equal start time, step, stop time and first stamp")
     with ExitStack() as stack:
 
         def begin() -> None:

@@ -25,7 +25,7 @@ class RealTime:
 
     def __init__(self, speed: float = 1.0) -> None:
         if not 0.0 < speed < inf:
-            raise InputError(f"`speed` {speed:g} is no factor")
+            raise InputError(f"`speed` {speed:g} must be > 0")
         self._speed, self.missed = speed, 0
         self.worst = 0.0
         self._start: float | None = None

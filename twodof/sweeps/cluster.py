@@ -118,7 +118,7 @@ class Cluster:
             now = time.monotonic()
             seen = now if workers else seen
             if now - seen > NO_WORKER:
-                raise SweepError("no worker is left; go on with `resume=True`")
+                raise SweepError("no worker is left; continue with `resume=True`")
             width = IN_HAND * max(1, workers)
             # all batches of a dead worker may have caused its death
             while len(tasks) < width and (batch := batches.next(alone=not tasks)):
@@ -137,7 +137,7 @@ def _result(future: Future, batch: list[Point], batches: Batches) -> list[Row]:
     except TwoDofError:
         raise
     except CancelledError as error:
-        raise SweepError("the scheduler is gone; go on with `resume=True`") from error
+        raise SweepError("the scheduler is gone; continue with `resume=True`") from error
     except Exception as error:
         raise SweepError(f"a worker failed: {error!r:.300}") from error
 

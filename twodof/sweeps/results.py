@@ -319,7 +319,7 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
                 " begin this sweep in another `output`, or resume that one as it was begun"
             )
     if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
-        raise SweepError(f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version")
+        raise SweepError(f"'{path}' was begun by twodof {there['versions']['twodof']}; continue with that version")
 
 
 def _differing(there: dict[str, object], wanted: dict[str, object]) -> str:
