@@ -59,7 +59,7 @@ static Status check_inputs(Instance *instance)
     const double *quat = &instance->state.plant.value[QUAT_DES];
     if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
         return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
-                      " turns nothing");
+                      " is no rotation");
 #else
     (void)instance;
 #endif
