@@ -57,7 +57,7 @@ def add(build: argparse.ArgumentParser) -> None:
         default="all",
         help="robot under its control law, or the control law alone, as a native FMU (%(default)s)",
     )
-    flag("--orientation", help="control the frame's orientation beside its position")
+    flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
     flag("--overwrite", help="replace an existing file that is not the default arm's FMU")

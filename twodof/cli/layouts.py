@@ -13,7 +13,7 @@ def add(layouts: argparse.ArgumentParser) -> None:
         "Write files in which RViz, PlotJuggler and Foxglove show a robot that is published, or"
         " recorded with --scene and --effort."
     )
-    add_fmu(layouts, "TwoDof.fmu, built if need be")
+    add_fmu(layouts, "TwoDof.fmu, built if it is missing")
     add_options(layouts, "--frame")
     layouts.add_argument(
         "-o", dest="folder", default=".", metavar="FOLDER", help="folder of the layout files (%(default)s)"

@@ -29,16 +29,16 @@ VERBS = {
     publish: "step an FMU in real time on a ROS 2 network",
     layouts: "write layouts of a robot for RViz, PlotJuggler and Foxglove",
     check: "check an FMU of any maker against the standard",
-    info: "show what is in an FMU, a bag or a sweep",
+    info: "show the contents of an FMU, a bag or a sweep",
     linearise: "show the linear model of a native FMU about an operating point",
     fit: "fit a robot's masses and friction to bags of its motion",
     plot: "draw bags, or the map of a sweep, into one figure",
     view: "replay a bag in the browser",
     live: "drive an FMU in the browser",
     page: "write a robot as one HTML file that runs",
-    sweep: "run an FMU over many gains, and map what comes out",
+    sweep: "run an FMU over many gains, and map the results",
     export: "write a bag as a table, or as one MCAP file",
-    recover: "make a bag whose writer died complete",
+    recover: "complete a bag whose writer died",
 }
 LONGEST_LINE = 2000
 

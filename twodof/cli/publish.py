@@ -24,7 +24,7 @@ def add(publish: argparse.ArgumentParser) -> None:
     publish.description = (
         "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
         " Ctrl-C. Received commands drive the robot: joint states on /joint_commands, or points"
-        " on /target_command and /clicked_point, as its control takes. Honours ROS_DOMAIN_ID,"
+        " on /target_command and /clicked_point, depending on its control. Honours ROS_DOMAIN_ID,"
         " ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and CYCLONEDDS_URI."
     )
     option, flag = publish.add_argument, partial(publish.add_argument, action="store_true")
@@ -32,7 +32,7 @@ def add(publish: argparse.ArgumentParser) -> None:
         "robots",
         nargs="*",
         metavar="[NAME=]FMU|URDF",
-        help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME or its file's",
+        help="default: TwoDof.fmu, built if it is missing; several run in step, each in a namespace",
     )
     add_output(publish, "BAG", "record a bag too, one of all robots")
     add_options(publish, "--frame")

@@ -8,7 +8,7 @@ from .printing import print_next, print_table, quote, say
 
 def add(recover: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    recover.description = "Make a bag whose writer died complete, so that every reader opens it."
+    recover.description = "Complete a bag whose writer died, so that every reader opens it."
     recover.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
 
 

@@ -29,16 +29,16 @@ def add(run: argparse.ArgumentParser) -> None:
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "default: rosbag2_<date and time>")
     add_options(run, "--stop-time", "--step")
-    run.add_argument("--measured", action="store_true", help="record joint states as measured, beside the true ones")
+    run.add_argument("--measured", action="store_true", help="record measured and true joint states")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
-    add_fmu(run, "TwoDof.fmu, built if need be", "FMU|SSP|URDF")
+    add_fmu(run, "TwoDof.fmu, built if it is missing", "FMU|SSP|URDF")
     add_options(run, "--robot", "--frame", *OF_A_RUN)
     run.add_argument(
         "--fail-if",
         action="append",
         default=[],
         metavar="CONDITION",
-        help="condition on the verdict that ends with exit status 3, as 'error > 1e-3' or 'saturated > 0.1'",
+        help="condition on the verdict that ends with exit status 3, such as 'error > 1e-3' or 'saturated > 0.1'",
     )
 
 

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 def add(sweep: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     sweep.description = (
-        "Run an FMU over a grid or random values of any of its inputs and parameters. The native"
-        " default FMU is built where none is named."
+        "Run an FMU over a grid or random values of any of its inputs and parameters. Without an FMU,"
+        " the native FMU of the default arm is used."
     )
     option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
     add_fmu(sweep, "the default arm's", "FMU")
