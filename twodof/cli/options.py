@@ -66,7 +66,7 @@ OF_A_PAGE: Table = {
 }
 OPTIONS: Table = {
     "--cost": dict(
-        metavar="EXPRESSION", help="cost of metrics that ranks the runs, such as 'settling + 0.1*peak_effort'"
+        metavar="EXPRESSION", help="cost that ranks the runs, such as 'settling + 0.1*peak_effort'"
     ),
     "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)"),
     "--robot": dict(default="", metavar="NAME", help="component of a system whose q and v are the robot's"),
