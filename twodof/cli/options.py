@@ -65,9 +65,7 @@ OF_A_PAGE: Table = {
     "--no-browser": dict(action="store_true", help="do not open a browser"),
 }
 OPTIONS: Table = {
-    "--cost": dict(
-        metavar="EXPRESSION", help="cost that ranks the runs, such as 'settling + 0.1*peak_effort'"
-    ),
+    "--cost": dict(metavar="EXPRESSION", help="cost that ranks the runs, such as 'settling + 0.1*peak_effort'"),
     "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)"),
     "--robot": dict(default="", metavar="NAME", help="component of a system whose q and v are the robot's"),
     "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),

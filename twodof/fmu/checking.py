@@ -1,4 +1,4 @@
-"""Check an FMU of any maker: its description, and trials of it in a child process."""
+"""Check a third-party FMU: its description, and trials in a child process."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Row(NamedTuple):
     """The result of one trial.
 
     Attributes:
-        name: of the trial.
-        outcome: "passed"; "failed", which the standard does not allow; "remark", which it allows and a user would not
-            expect; or "does not apply".
-        text: a line on what held, what did not, or why it does not apply.
+        name: name of the trial.
+        outcome: "passed"; "failed" (the standard forbids it); "remark" (the standard allows it, but a user would not
+            expect it); or "does not apply".
+        text: one line with the result, or with the reason.
     """
 
     name: str
@@ -43,8 +43,8 @@ class Check:
     """The results of a check.
 
     Attributes:
-        path: the FMU.
-        rows: of its trials, in order.
+        path: path of the FMU.
+        rows: results of the trials, in order.
     """
 
     path: Path
@@ -62,15 +62,15 @@ class Check:
         return card(f"Check of {self.path}", {row.name: f"{row.outcome}: {row.text}" for row in self.rows})
 
     def facts(self) -> dict[str, object]:
-        """Return the check as JSON has it."""
+        """Return the check for JSON."""
         return {**asdict(self), "path": str(self.path), "passed": self.passed, "rows": [r._asdict() for r in self.rows]}
 
 
 def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
     """Check an FMU of any maker: description, states, steps, derivatives, order of calls, and references it carries.
 
-    The FMU runs in a child process, whose crash is a failed row. It is a program all the same: check only an FMU that
-    you would run.
+    The FMU runs in a child process, whose crash is a failed row. An FMU is a program: check only an FMU that you would
+    run.
 
     Args:
         fmu: an FMI 2.0 or 3.0 co-simulation FMU with a binary for this machine.
@@ -109,7 +109,7 @@ def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
 
 
 def _tried(path: Path, names: Sequence[str]) -> Iterator[Row]:
-    """Yield a row of each trial; after a crash the rest is tried in a new process."""
+    """Yield the row of each trial; after a crash, a new process does the remaining trials."""
     todo = [*names]
     while todo:
         doing = "its start"
@@ -127,7 +127,7 @@ def _tried(path: Path, names: Sequence[str]) -> Iterator[Row]:
 
 
 def _serve(pipe: Connection, path: Path, names: Sequence[str]) -> None:
-    """Do the trials in the child; send what is done next, and each result."""
+    """Do the trials in the child; send the name of each call before it, and each result."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def send(*words: str) -> None:
@@ -148,6 +148,6 @@ def _serve(pipe: Connection, path: Path, names: Sequence[str]) -> None:
             text = result(name)
         except UnpassedError as unpassed:
             outcome, text = unpassed.outcome, str(unpassed)
-        except Exception as error:  # whatever the FMU makes FMPy raise is the result of this trial
+        except Exception as error:  # any exception of FMPy is the result of this trial
             outcome, text = "failed", f"{error}" or type(error).__name__
         send("row", outcome, text[:1000])

@@ -1,6 +1,7 @@
-"""Trials of a co-simulation FMU of any maker against what the FMI standard demands of it.
+"""Trials of a co-simulation FMU against requirements of the FMI standard.
 
-Each takes a Trial and returns a line on what held. Equal means bit-identical. Sources: FMI 2.0.5, sections 2.1 and
+Each function has an argument Trial and returns a line with the result. Equal means bit-identical. Sources: FMI 2.0.5,
+sections 2.1 and
 4.2; FMI 3.0.2, sections 2.2 and 4.2.
 """
 
@@ -24,19 +25,20 @@ from .system_instance import instantiate_fmu
 
 STEPS = 20
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
-"""Sizes of variable steps, of the default one."""
-MOST_KNOWNS = 200  # inputs and states by which is differentiated
-DELTA = 1e-4  # change of a variable, of its magnitude or of 1
+"""Sizes of variable steps, as multiples of the default step."""
+MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
+DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
 SMOOTH, EXACT = 1e-3, 1e-7
-"""Of a derivative's magnitude, or of 1: how far difference quotients of two widths may differ where it is compared,
-and how far it may be from them beside that."""
+"""Largest difference between the difference quotients of two widths with which a derivative is compared, and tolerance
+of the comparison in addition to it, both relative to the derivative's magnitude or to 1.
+"""
 UNKNOWN = 2**31 - 9  # a value reference that no variable has
 Outputs = tuple[float, ...]
 Calls = dict[str, tuple[str, Callable[[Instance], object]]]
 
 
 class UnpassedError(Exception):
-    """A trial has another outcome than "passed", and the FMU is not at fault: "remark" or "does not apply"."""
+    """A trial ends with the outcome "remark" or "does not apply"."""
 
     def __init__(self, outcome: str, text: str) -> None:
         super().__init__(text)
@@ -48,10 +50,10 @@ class Trial:
 
     Args:
         fmu: the FMU.
-        note: called with what is done next, which a crash is reported with.
+        note: called with the name of the next call, which the report of a crash contains.
 
     Attributes:
-        start, step: of its default experiment, s.
+        start, step: start time and step of its default experiment, s.
         variables: FMPy's descriptions of real variables, by the names of their elements.
         outputs, inputs: names of real outputs and continuous inputs.
     """
@@ -72,7 +74,7 @@ class Trial:
         self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
 
     def require(self, *claims: str) -> None:
-        """End a trial of what the description does not claim."""
+        """End a trial of a feature that the description does not claim."""
         for claim in claims:
             if not getattr(self.about.coSimulation, claim):
                 raise UnpassedError("does not apply", f"it does not state {claim}")
@@ -104,14 +106,14 @@ class Trial:
         return rows
 
     def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
-        """Refuse rows that are not equal, by the first output that differs."""
+        """Raise for rows that are not equal, with the name of the first output that differs."""
         for k, pair in enumerate(zip(expected, rows)):
             for name, x, y in zip(self.outputs, *pair):
                 if x != y:
                     raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, {k + 1} steps on")
 
     def inside(self, name: str, change: float) -> float:
-        """Return a variable's start value plus a change, that far inside its range where the range is wide enough."""
+        """Return a variable's start value plus a change, with this distance from its bounds if the range allows it."""
         variable, start = self.variables[name], self.fmu.variables[name].start_value or 0.0
         low, high = (end if text is None else float(text) for text, end in ((variable.min, -inf), (variable.max, inf)))
         margin = change if high - low > 2.0 * change else 0.0
@@ -119,7 +121,7 @@ class Trial:
 
 
 def simulation(trial: Trial) -> str:
-    """Step by the default experiment."""
+    """Do the steps of the default experiment."""
     with trial.instance() as instance:
         trial.rows(instance)
     return f"{STEPS} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
@@ -159,7 +161,7 @@ def state(trial: Trial) -> str:
 
 
 def serialised_state(trial: Trial) -> str:
-    """Restore a state that was serialised."""
+    """Restore a serialised state."""
     trial.require("canGetAndSetFMUstate", "canSerializeFMUstate")
     return _restored(trial, lambda slave, saved: slave.deserializeFMUState(bytes(slave.serializeFMUState(saved))))
 
@@ -181,7 +183,7 @@ def _restored(trial: Trial, converted: Callable[[Any, Any], Any]) -> str:
 
 
 def variable_steps(trial: Trial) -> str:
-    """Take steps of different sizes, and compare their end with that of as many equal ones."""
+    """Take steps of different sizes, and compare the end with that of equal steps."""
     trial.require("canHandleVariableCommunicationStepSize")
     with trial.instance() as instance:
         equal = trial.rows(instance, round(sum(SIZES)))[-1]
@@ -199,7 +201,7 @@ def variable_steps(trial: Trial) -> str:
 
 
 def inputs(trial: Trial) -> str:
-    """Change each continuous input; at the end of initialisation, outputs depend on no inputs but those they state."""
+    """Change each continuous input; check that outputs depend only on stated inputs at the end of initialisation."""
     if not trial.inputs:
         raise UnpassedError("does not apply", "it has no continuous real inputs")
     stated = {u.variable: u.dependencies for u in trial.about.initialUnknowns if u.dependencies is not None}
@@ -281,7 +283,7 @@ def call_order(trial: Trial) -> str:
 
 
 def _forbidden(trial: Trial) -> Calls:
-    """Return forbidden calls by what they do, with the state they are made in: "new", "stepping" or "ended"."""
+    """Return forbidden calls by description, with the state in which they are made: "new", "stepping" or "ended"."""
     t, h = trial.start, trial.step
     read = "getReal" if trial.fmu.version == 2 else "getFloat64"
     fixed = [n for n, v in trial.variables.items() if v.causality == "parameter" and v.variability == "fixed"][:1]

@@ -1,4 +1,4 @@
-"""Maximum likelihood of free parameters, their covariance, and tests of the model."""
+"""Maximum-likelihood estimate of free parameters, its covariance, and tests of the model."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from .regression import EDGES, Rows, jacobian, residual, rows_of
 from .stretches import Array, Stretch
 
 PRIOR = 3.0
-"""Standard deviation of the weak prior about the URDF's values, in scales: it holds what the data do not see."""
+"""Standard deviation, in scales, of the weak prior, which fixes directions that the data do not determine."""
 TOLERANCE = 1e-10
 PASSES, FIRST_NOISE = 6, 0.02
-"""Times that the variances of noise are estimated anew, and the noise at first, a part of the efforts."""
+"""Number of estimates of the noise variances, and the initial noise, as a fraction of the efforts."""
 DELAY_SCALE = 0.02  # s
-FEWEST = 20  # rows of a bin of noise
+FEWEST = 20  # rows for the estimate of a bin's noise
 PRIOR_SHARE = 0.1
-"""Of the variance of a value: beyond it the value is that of the URDF, and not known by the data."""
+"""Share of the prior in the variance of a value, above which the data do not determine the value."""
 UNEXPLAINED, SIGNIFICANCE = 0.01, 1e-4
-"""Slow residuals are reported from this part of the efforts on, and below this probability."""
+"""Slow residuals are reported if they exceed this fraction of the efforts, and have less than this probability."""
 
 
 class Misfit(NamedTuple):
-    """Slow residuals of one joint beside its fast ones.
+    """Comparison of the slow and the fast residuals of one joint.
 
     Attributes:
-        joint: index.
-        rms: of the slow residuals, N·m or N.
-        ratio: of the variances of slow and fast residuals.
-        probability: of such a ratio if noise were white.
-        part: of the efforts that the slow residuals are.
+        joint: index of the joint.
+        rms: root mean square of the slow residuals, N·m or N.
+        ratio: ratio of the variances of slow and fast residuals.
+        probability: probability of a ratio of this size or more with white noise.
+        part: ratio of the root mean squares of slow residuals and efforts.
     """
 
     joint: int
@@ -46,7 +46,7 @@ class Misfit(NamedTuple):
 
     @property
     def bad(self) -> bool:
-        """True where the model does not explain the data."""
+        """True if the model does not explain the data."""
         return self.probability < SIGNIFICANCE and self.part > UNEXPLAINED
 
 
@@ -56,13 +56,13 @@ class Estimate(NamedTuple):
     Attributes:
         x: coordinates, p.
         values: physical values.
-        covariance: of the reported values, r × r, with the prior.
-        known: whether the data tell a reported value, r.
-        unseen: directions that the data do not see, in scales, directions × p.
-        delay: of recorded efforts, s, and its standard deviation.
+        covariance: covariance of the reported values, r × r, with the prior.
+        known: whether the data determine each reported value, r.
+        unseen: directions that the data do not determine, in scales, directions × p.
+        delay: delay of recorded efforts, s, and its standard deviation.
         noise: standard deviation of the efforts' noise, N·m or N, n.
-        misfits: of the joints.
-        evaluations: of the residuals.
+        misfits: comparison of residuals for each joint.
+        evaluations: number of evaluations of the residuals.
     """
 
     x: Array
@@ -98,7 +98,7 @@ def estimate(parameters: Parameters, stretches: Sequence[Stretch]) -> Estimate:
 
 
 def _typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
-    """Return friction, damping and armature that would explain the efforts of each joint alone."""
+    """Return the friction, damping and armature that would each explain a joint's efforts without other causes."""
     rms = {name: np.sqrt(np.mean(np.concatenate([getattr(s, name) for s in stretches]) ** 2, 0)) for name in "va"}
     effort = np.sqrt(np.mean(np.concatenate([s.tau for s in stretches]) ** 2, axis=0))
     return {"friction": effort, "damping": effort / rms["v"], "armature": effort / rms["a"]}
@@ -107,7 +107,7 @@ def _typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
 def _solve(
     parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, start: Array, low: Array, scales: Array
 ) -> Any:
-    """Return the least squares of the whitened rows and the weak prior, as SciPy has it."""
+    """Return SciPy's least-squares result for the whitened rows and the weak prior."""
 
     def errors(z: Array) -> Array:
         dynamics = parameters.dynamics(parameters.values(z[:-1]))
@@ -124,7 +124,7 @@ def _solve(
 
 
 def _information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:
-    """Return the Jacobian of the whitened residuals by the coordinates, the delay last."""
+    """Return the Jacobian of the whitened residuals with respect to the coordinates and, last, the delay."""
     dynamics = parameters.dynamics(parameters.values(z[:-1]))
     rates = parameters.rates(z[:-1])[1]
     return np.vstack([jacobian(each, dynamics, rates) / s[:, None] for each, s in zip(rows, sd)])
@@ -171,7 +171,7 @@ def _result(
 
 
 def _misfit(rows: Rows, errors: Array, used: float) -> Misfit:
-    """Compare slow residuals, where the motion is, with those of the middle of the band."""
+    """Compare slow residuals, at the frequencies of the motion, with those in the middle of the band."""
     slow, fast = rows.bin < 2, (rows.bin >= 2) & (rows.bin < 5)
     own, other = max(1.0, slow.sum() - used), max(1.0, float(fast.sum()))
     ratio = float(np.sum(errors[slow] ** 2) / own / max(np.sum(errors[fast] ** 2) / other, 1e-300))

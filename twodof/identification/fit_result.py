@@ -25,12 +25,12 @@ class FittedParameter(NamedTuple):
     """A free parameter before and after a fit.
 
     Attributes:
-        name: as the pattern names it.
-        unit: FMI unit name, "" where there is none.
-        before, after: values.
-        deviation: standard deviation of the value after.
+        name: name of the parameter, as in patterns.
+        unit: FMI unit name, or "".
+        before, after: values before and after the fit.
+        deviation: standard deviation of the fitted value.
         low, high: 95 % interval.
-        known: False where the data do not tell the value, which then is that of before.
+        known: whether the data determine the value; if not, it keeps its value.
     """
 
     name: str
@@ -49,17 +49,17 @@ class Fit:
 
     Attributes:
         urdf: name of the URDF's file.
-        fitted_urdf: its text with fitted numbers.
+        fitted_urdf: text of the URDF with fitted numbers.
         joints: names of the robot's n joints.
-        parameters: the free ones.
-        unseen: for each direction that the data do not see, the parameters that make it up.
+        parameters: the free parameters.
+        unseen: parameters that form each direction that the data do not determine.
         misfits: test of the model at each joint.
         noise: standard deviation of the efforts' residuals at each joint, N·m or N.
-        delay: from a recorded effort to its action, s, and its standard deviation.
-        deviation_before, deviation: root mean square of simulated less measured positions of each joint in the
-            stretches held out, rad or m, with the parameters before and after; empty where none was long enough.
-        settings: fitted values that a URDF cannot hold, by variable of the FMU.
-        covariance: of the parameters, in their order.
+        delay: time from a recorded effort to its action, s, and its standard deviation.
+        deviation_before, deviation: root mean square of simulated minus measured positions of each joint in the
+            held-out stretches, rad or m, before and after the fit; empty if no stretch is long enough.
+        settings: fitted values that a URDF cannot store, by variable of the FMU.
+        covariance: covariance of the parameters, in their order.
     """
 
     urdf: str
@@ -77,7 +77,7 @@ class Fit:
 
     @property
     def explains(self) -> bool:
-        """True where the residuals at all joints are noise."""
+        """True if the residuals at all joints are noise."""
         return not any(misfit.bad for misfit in self.misfits)
 
     @property
@@ -91,7 +91,7 @@ class Fit:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings and results, a line each."""
+        """Warnings and results, one line each."""
         lines = []
         if self.unseen:
             lines.append(f"the data do not tell: {'; '.join(self.unseen)}")
@@ -146,7 +146,7 @@ class Fit:
         }
 
     def save(self, folder: str | Path) -> Path:
-        """Write robot.urdf and fit.json into a new folder, whole or not at all; return its path.
+        """Write robot.urdf and fit.json into a new folder, completely or not at all; return its path.
 
         Raises:
             InputError: the folder exists or cannot be written.
@@ -164,7 +164,7 @@ class Fit:
 
 
 def check_folder(folder: str | Path) -> Path:
-    """Return the path of a folder that is to be written; raise InputError where something is there."""
+    """Return the path of a new output folder; raise InputError if the path exists."""
     path = Path(folder)
     if os.path.lexists(path):
         raise InputError(f"'{path}' exists, and is not replaced: remove it, or give another `output`")

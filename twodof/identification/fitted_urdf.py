@@ -1,4 +1,4 @@
-"""A URDF with fitted numbers, its comments, order and all other text kept."""
+"""Write fitted numbers into a URDF, and keep its comments, order and all other text."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ DIGITS = 9
 
 
 def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -> bytes:
-    """Return the text of a URDF with the fitted values that a URDF can hold.
+    """Return the text of a URDF with the fitted values that a URDF can store.
 
-    These are friction and damping of joints, and masses, centres and inertias of links. A joint that others mimic
-    shares friction and damping with them, in the proportions of before.
+    These are friction and damping of joints, and masses, centres and inertias of links. Joints that mimic each other
+    share friction and damping in their original proportions.
 
     Args:
-        text: of the URDF.
-        urdf: the same, read.
-        parameters: the free ones.
-        values: of all.
+        text: text of the URDF.
+        urdf: the parsed URDF.
+        parameters: the free parameters.
+        values: values of all parameters.
     """
     parser = lxml.etree.XMLParser(encoding="utf-8", resolve_entities=False, no_network=True, huge_tree=False)
     tree = lxml.etree.parse(io.BytesIO(text.encode()), parser)
@@ -64,7 +64,7 @@ def _write_link(inertial: Any, group: str, link: int, values: Values) -> None:
 
 
 def _child(element: Any, tag: str, *, first: bool = False) -> Any:
-    """Return the child of an element with a tag, made where there is none, with the indentation of the others."""
+    """Return an element's child with a tag; if it is missing, make it with the indentation of the others."""
     found = element.find(tag)
     if found is None:
         found = lxml.etree.Element(tag)

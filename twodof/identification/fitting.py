@@ -22,7 +22,7 @@ from .regression import regressors
 from .stretches import Array, Stretch, stretches
 
 WRONG_UNITS = 300.0
-"""Ratio of recorded efforts to those of the URDF's masses, from which another unit is suspected."""
+"""Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
 NORMAL_95 = 1.959964
 POSITIVE = ("friction", "damping", "armature", "payload", "mass")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -40,21 +40,22 @@ def fit(
 ) -> Fit:
     """Fit parameters of a robot to bags of its motion, with positions and efforts of its joints.
 
-    The last fifth of each bag is held out: it is predicted and never fitted.
+    The last fifth of each bag is held out: it is predicted, but not used by the fit.
 
     Args:
-        urdf: the URDF or xacro file with the values to begin with.
-        bags: of any writer, with JointStates.
+        urdf: the URDF or xacro file with the initial values.
+        bags: bags of any writer, with JointStates.
         free: names or shell patterns of the free parameters: ``friction[1]``, ``damping[1]``, ``armature[1]``,
             ``offset:JOINT``, ``gain:JOINT``, ``mass:LINK``, ``com:LINK``, ``inertia:LINK``, ``payload``,
             ``payload_com``, ``gravity``.
-        output: folder for robot.urdf and fit.json, which must not exist; None: none.
+        output: new folder for robot.urdf and fit.json; None: nothing is written.
         frame: link of the payload; None: "EndEffector", or the only last link.
         lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
         gravity: m/s² in the root frame; None: that of the bag's run, else (0, 0, −9.81).
 
     Raises:
-        InputError: a bag does not fit the robot, is too short, or has values that are none; a pattern matches nothing.
+        InputError: a bag does not fit the robot, is too short, or has values that are not finite; or a pattern
+            matches no parameter.
         BuildError: the URDF cannot be read.
         BagError: a bag cannot be read.
     """
@@ -94,10 +95,10 @@ def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
 
 
 def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
-    """Refuse efforts far from those of the URDF's masses.
+    """Refuse efforts that differ much from those of the URDF's masses.
 
     Raises:
-        InputError: saying how far.
+        InputError: the message has the ratio.
     """
     values = parameters.dynamics(parameters.start)
     stretch = max(fitted, key=lambda each: len(each.t))
@@ -152,7 +153,7 @@ def _parameters(parameters: Parameters, found: Estimate) -> list[FittedParameter
 
 
 def _unseen(parameters: Parameters, found: Estimate) -> list[str]:
-    """Return the names of the coordinates that make up each direction which the data do not see."""
+    """Return the names of the coordinates that form each direction that the data do not determine."""
     names = parameters.coordinate_names
     lines = []
     for direction in found.unseen:
@@ -163,7 +164,7 @@ def _unseen(parameters: Parameters, found: Estimate) -> list[str]:
 
 
 def _settings(parameters: Parameters, after: Dynamics, found: Estimate) -> dict[str, tuple[float, ...]]:
-    """Return the fitted values that a URDF cannot hold, as settings of a build."""
+    """Return the fitted values that a URDF cannot store, as settings of a build."""
     groups = {free.group for free in parameters.free}
     settings: dict[str, Array] = {}
     if "armature" in groups:

@@ -1,4 +1,4 @@
-"""Inertias of links: of a URDF, as second moments of mass, and as dynamic parameters of bodies."""
+"""Inertias of links as in a URDF, as second moments of mass, and as dynamic parameters of bodies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..plant.urdf import Urdf
 
 Array = NDArray[np.float64]
 INERTIA = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-"""Attributes of <inertia>, and where they are in the matrix."""
+"""Attributes of <inertia>, and their indices in the matrix."""
 
 
 def inertia_of(second: NDArray[Any]) -> NDArray[Any]:
@@ -34,7 +34,7 @@ def dynamic_parameters(mass: Any, com: Any, second: Any, R: Array, p: Array) -> 
 
 
 def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], list[pin.SE3], list[pin.Inertia]]:
-    """Return the links that move and have mass: names, bodies, places in these, and inertias in the links' frames."""
+    """Return the moving links with mass: names, bodies, poses in these, and inertias in the links' frames."""
     names, bodies, places, inertias = [], [], [], []
     for element in urdf.tree.findall("link"):
         name = str(element.get("name"))
@@ -58,7 +58,7 @@ def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], li
 
 
 def inertial_place(inertial: Any) -> pin.SE3:
-    """Return the place of an <inertial> element's frame in its link's."""
+    """Return the pose of an <inertial> element's frame in its link's frame."""
     origin = inertial.find("origin")
     xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))
     x, r = (np.array([float(word) for word in text.split()]) for text in (xyz, rpy))

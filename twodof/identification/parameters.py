@@ -1,6 +1,6 @@
-"""Free parameters of a fit, and the physical values that their coordinates give.
+"""Free parameters of a fit, and their physical values as a function of coordinates.
 
-Each coordinate is free of constraints, or has 0 as its lower bound, and any value of it is a possible robot:
+Each coordinate is unconstrained, or has the lower bound 0, and each of its values gives a physically possible robot:
 
     mass     m = exp(x)
     inertia  I = tr(Σ) 1 − Σ,  Σ = L Lᵀ,  L triangular with diagonal exp(x): the second moments of mass about the
@@ -34,10 +34,10 @@ OF_JOINTS = ("friction", "damping", "armature", "offset", "gain")
 OF_LINKS = ("mass", "com", "inertia")
 OF_THE_ROBOT = ("payload", "payload_com", "gravity")
 ROWS, COLUMNS = np.tril_indices(3)
-LEAST_MOMENT = 1e-3  # of m·(5 cm)², m²: second moments of mass that a free inertia begins with at least
-LEAST_PAYLOAD = 0.01  # of the moving mass: a payload whose place is free begins with at least this
+LEAST_MOMENT = 1e-3  # fraction of m·(5 cm)²: smallest initial second moments of mass of a free inertia
+LEAST_PAYLOAD = 0.01  # fraction of the moving mass: smallest initial payload if its position is free
 SEEN = 0.5
-"""A direction is seen if its standard deviation is below this part of the parameters' scales."""
+"""The data determine a direction if its standard deviation is below this fraction of the parameters' scales."""
 
 
 @dataclass
@@ -45,14 +45,14 @@ class Values:
     """Physical values of all parameters of a robot with n joints and k links that move and have mass.
 
     Attributes:
-        friction, damping, armature: of joints, n.
-        offset: what a position is more than its encoder shows, rad or m, n.
-        gain: what an effort is as a multiple of the recorded one, n.
-        mass: of links, kg, k.
-        com: their centres in the links' frames, m, k × 3.
-        second: their second moments of mass about the centre, in the links' axes, kg·m², k × 3 × 3.
+        friction, damping, armature: values of the joints, n each.
+        offset: true minus measured position, rad or m, n.
+        gain: ratio of true to recorded effort, n.
+        mass: masses of links, kg, k.
+        com: centres of mass in the links' frames, m, k × 3.
+        second: second moments of mass about the centre, in the links' axes, kg·m², k × 3 × 3.
         payload: point mass in the task frame, kg, 1.
-        payload_com: where it is in the task frame, m, 3.
+        payload_com: position of the payload in the task frame, m, 3.
         gravity: m/s², root frame, 3.
     """
 
@@ -69,12 +69,12 @@ class Values:
     gravity: Any
 
     def copy(self, kind: type) -> Values:
-        """Return a copy with numbers of a kind, float or complex."""
+        """Return a copy with numbers of a type, float or complex."""
         return Values(*(np.array(getattr(self, field.name), kind) for field in fields(self)))
 
 
 class Dynamics(NamedTuple):
-    """Values of inverse dynamics, or derivatives of this by the coordinates along a last axis.
+    """Parameters of inverse dynamics, or their derivatives with respect to the coordinates along a last axis.
 
     Attributes:
         inertial: ten dynamic parameters of each body about its joint's frame, in Pinocchio's order, 10·bodies;
@@ -92,7 +92,7 @@ class Dynamics(NamedTuple):
 
 
 class Free(NamedTuple):
-    """Free parameters of one joint or link: the group, the index of that, and the names and units of its values."""
+    """Free parameters of one joint or link: group, index of joint or link, names and units of the values."""
 
     group: str
     place: int
@@ -105,17 +105,17 @@ class Parameters:
 
     Attributes:
         robot: the robot.
-        links, bodies, places: names of the links that move and have mass, and of each the body that it is a part of
-            and where in that it is.
-        given, start: values of all parameters by the URDF, and those at which the coordinates begin.
-        free: the free ones.
-        names, units: of their values.
-        coordinate_names: of their coordinates, without the axes.
+        links, bodies, places: names of the moving links with mass, the body of which each is a part, and its pose in
+            this body.
+        given, start: values of all parameters in the URDF, and the start values of the coordinates.
+        free: the free parameters.
+        names, units: names and units of their values.
+        coordinate_names: names of their coordinates, without the axes.
 
     Args:
         urdf, robot: the robot, read.
         patterns: names or shell patterns.
-        gravity: at first, m/s².
+        gravity: initial gravity, m/s².
 
     Raises:
         InputError: a pattern matches nothing.
@@ -145,7 +145,7 @@ class Parameters:
         names = [name for name, _ in known]
         chosen: set[str] = set()
         for pattern in patterns:
-            # brackets are those of names
+            # brackets are part of names, not of patterns
             matches = fnmatch.filter(names, pattern.replace("[", "[[]"))
             if not matches:
                 raise InputError(f"`free` '{pattern}' matches no parameter{choice(pattern, names)}")
@@ -184,7 +184,7 @@ class Parameters:
         return known
 
     def _settle(self) -> None:
-        """Move start values off the edge of what is possible, where their coordinates have no value."""
+        """Move start values away from the boundary of possible robots, at which coordinates are infinite."""
         start, groups = self.start, [free.group for free in self.free]
         moving = float(start.mass.sum())
         if "payload_com" in groups:
@@ -201,7 +201,7 @@ class Parameters:
         """Return the coordinates of the start values, their lower bounds, and their scales.
 
         Args:
-            typical: sizes of friction, damping and armature at each joint, n each.
+            typical: typical friction, damping and armature of each joint, n each.
         """
         x: list[float] = []
         low: list[float] = []
@@ -225,7 +225,7 @@ class Parameters:
         return np.array(x), np.array(low), self._scales(typical)
 
     def _scales(self, typical: Mapping[str, Array]) -> Array:
-        """Return how much each coordinate may be off: a multiple of it that nobody would call known."""
+        """Return the scale of each coordinate: a deviation so large that the coordinate would be unknown."""
         moving = float(self.start.mass.sum())
         scales: list[float] = []
         for free in self.free:
@@ -289,7 +289,7 @@ class Parameters:
         return np.array(numbers)
 
     def dynamics(self, values: Values) -> Dynamics:
-        """Return what inverse dynamics needs of the values."""
+        """Return the parameters of inverse dynamics for given values."""
         others = (getattr(values, field) for field in Dynamics._fields[1:])
         return Dynamics(self._inertial(values), *others)
 
@@ -307,7 +307,7 @@ class Parameters:
         return out
 
     def rates(self, x: Array) -> tuple[Array, Dynamics]:
-        """Return the exact derivatives of reported values and dynamics by the coordinates, by complex steps."""
+        """Return the exact derivatives of reported values and dynamics in the coordinates, by complex steps."""
         step, columns = 1e-30, []
         for k in range(len(x)):
             moved = x.astype(complex)

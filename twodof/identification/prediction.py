@@ -1,4 +1,4 @@
-"""Simulated beside measured motion: the plant, driven by recorded efforts, from measured states."""
+"""Simulate the plant under recorded efforts from measured states, for comparison with the measured motion."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ RTOL, ATOL = 1e-5, 1e-7
 
 
 class Prediction(NamedTuple):
-    """A stretch simulated in windows: positions, not numbers where the plant cannot be simulated, and the windows.
+    """A stretch that was simulated in windows.
 
     Attributes:
-        q: simulated positions, as the encoders would show them, N × n.
+        q: simulated positions as the encoders would measure them, N × n; NaN where the simulation failed.
         begins: indices of the samples at which windows begin.
     """
 
@@ -33,7 +33,7 @@ class Prediction(NamedTuple):
 
 
 def plant_of(robot: Robot, values: Dynamics, step: float) -> Plant:
-    """Return the bare plant of a robot with values of its parameters."""
+    """Return the bare plant of a robot with given values of its parameters."""
     model = robot.model.copy()
     for body, ten in enumerate(values.inertial.reshape(-1, 10)):
         model.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
@@ -57,12 +57,12 @@ def predict(robot: Robot, values: Dynamics, delay: float, stretch: Stretch) -> P
 
     Args:
         robot: the robot.
-        values: of its parameters.
-        delay: of the recorded efforts, s.
+        values: values of its parameters.
+        delay: delay of the recorded efforts, s.
         stretch: the samples.
     """
     plant, h = plant_of(robot, values, stretch.step), stretch.step
-    edges = stretch.t[:, None] + np.array([0.0, 0.5 * h]) - delay  # of each step: its beginning and its middle
+    edges = stretch.t[:, None] + np.array([0.0, 0.5 * h]) - delay  # beginning and middle of each step
     effort = np.stack([np.interp(edges[:, 1], stretch.t, column) for column in stretch.tau.T], 1) * values.gain
     q = np.full_like(stretch.q, np.nan)
     begins = range(0, len(q) - 1, max(1, round(WINDOW / h)))
@@ -81,6 +81,6 @@ def predict(robot: Robot, values: Dynamics, delay: float, stretch: Stretch) -> P
 
 
 def deviation(stretches: Sequence[Stretch], predictions: Sequence[Prediction]) -> Array:
-    """Return the root mean square of simulated less measured positions of each joint, rad or m, n."""
+    """Return the root mean square of simulated minus measured positions of each joint, rad or m, n."""
     errors = np.concatenate([p.q - s.measured for s, p in zip(stretches, predictions)])
     return np.asarray(np.sqrt(np.mean(errors**2, axis=0)))

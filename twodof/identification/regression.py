@@ -1,11 +1,11 @@
-"""Inverse dynamics along measured motion as a regression, whose rows are independent in noise.
+"""Inverse dynamics along measured motion as a regression whose rows have independent noise.
 
     τ_rec(t − delay) = (Y(q, v, q̈) π + F sgn v + D v + armature q̈)/gain + noise
 
-π are the ten inertial parameters of each body. For each joint and each stretch in which it moves, rows are
-coefficients in an orthonormal basis of smooth functions below the band's end, so that noise white in time stays white,
-and noise of positions, which the second derivative raises, is left out. Their variance depends on joint and frequency,
-and is estimated by the residuals.
+π are the ten inertial parameters of each body. For each joint and each stretch in which it moves, rows are coefficients
+in an orthonormal basis of smooth functions within the band. White noise stays white in this basis, and position noise,
+which the second derivative amplifies, is left out. The variance of rows depends on joint and frequency, and is
+estimated from the residuals.
 
 Sources: Janot, Vandanjon, Gautier, "A generic instrumental variable approach for industrial robot identification",
 IEEE TCST 22, 2014, for the regression; Whittle, "Estimation and information in stationary time series", 1953, for the
@@ -29,24 +29,24 @@ from .parameters import Dynamics
 from .stretches import Array, Stretch
 
 LEAST_SAMPLES, LONGEST = 12, 400
-"""Samples of a stretch in which a joint moves at least; a longer one is divided."""
+"""Smallest and largest number of samples of a stretch in which a joint moves; a longer one is divided."""
 EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
-"""Edges of the bins of frequency in which noise has one variance, parts of the band."""
+"""Edges of the frequency bins, in each of which noise has one variance, as fractions of the band."""
 
 
 class Rows(NamedTuple):
     """Rows of one joint.
 
     Attributes:
-        joint: its index.
+        joint: index of the joint.
         Y: regressor of the inertial parameters without gravity, K × 10·bodies.
         G: regressors per m/s² of gravity along x, y and z of the root, 3 × K × 10·bodies.
-        sign, v, a: of friction, damping and armature, K.
+        sign, v, a: regressors of friction, damping and armature, K each.
         tau, tau_rate: recorded effort and its derivative, K.
         offsets: derivative of the inverse dynamics with respect to positions, K × n.
-        bin: index of each row's bin of frequency, K.
-        block: index of the stretch of motion that a row is of, K.
-        about: offsets, n, and delay of the efforts, s, at which the rows are exact.
+        bin: index of each row's frequency bin, K.
+        block: index of each row's stretch of motion, K.
+        about: offsets, n, and delay of the efforts, s, at which the rows were linearised.
     """
 
     joint: int
@@ -69,7 +69,7 @@ def regressors(robot: Robot, stretch: Stretch, offset: Array) -> tuple[Array, Ar
     Args:
         robot: the robot.
         stretch: samples of its motion.
-        offset: what positions are more than recorded, rad or m, n.
+        offset: true minus measured positions, rad or m, n.
     """
     model = robot.model.copy()
     data, n = model.createData(), len(robot.joints)
@@ -92,7 +92,7 @@ def regressors(robot: Robot, stretch: Stretch, offset: Array) -> tuple[Array, Ar
 def rows_of(
     robot: Robot, values: Dynamics, stretches: Sequence[Stretch], delay: float, with_offsets: bool
 ) -> list[Rows]:
-    """Return the rows of each joint, about values of the parameters and a delay of the efforts, s."""
+    """Return the rows of each joint, linearised at values of the parameters and a delay of the efforts, s."""
     found: list[list[Rows]] = [[] for _ in robot.joints]
     block, about = 0, (values.offset, delay)
     for stretch in stretches:
@@ -134,7 +134,7 @@ def _joined(rows: list[Rows]) -> Rows:
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the begin and the end of each run of True, of long ones in parts."""
+    """Return the begin and the end of each run of True values; long runs are divided."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False])).tolist()
     runs = []
     for begin, end in zip(edges[::2], edges[1::2]):
@@ -145,10 +145,10 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 @cache
 def smooth_basis(size: int, count: int) -> Array:
-    """Return orthonormal rows, count × size: cosines of rising frequency that fade to 0 at both ends.
+    """Return orthonormal rows, count × size: cosines of increasing frequency that fade to 0 at both ends.
 
-    White noise stays white in them, and as the functions begin and end smoothly, fast noise does not leak into slow
-    rows.
+    White noise stays white in this basis. The functions begin and end smoothly, so that fast noise does not leak into
+    slow rows.
     """
     at = (np.arange(size) + 0.5) / size
     waves = np.cos(np.pi * at[:, None] * np.arange(count)) * np.sin(np.pi * at[:, None]) ** 2
@@ -163,7 +163,7 @@ def _delayed(stretch: Stretch, delay: float) -> Array:
 
 
 def _position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wanted: bool) -> Array:
-    """Return the derivative of the inverse dynamics with respect to positions, N × n × n; 0 where not wanted."""
+    """Return the derivative of the inverse dynamics with respect to positions, N × n × n; 0 if it is not needed."""
     model = robot.model.copy()
     model.gravity.linear = values.gravity
     for body, ten in enumerate(values.inertial.reshape(-1, 10)):
@@ -188,7 +188,7 @@ def residual(rows: Rows, values: Dynamics, delay: float) -> Array:
 
 
 def modelled(rows: Rows, values: Dynamics) -> Array:
-    """Return the effort by the model, N·m or N."""
+    """Return the effort that the model gives, N·m or N."""
     i = rows.joint
     links = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ values.inertial
     joint = values.friction[i] * rows.sign + values.damping[i] * rows.v + values.armature[i] * rows.a
@@ -196,12 +196,12 @@ def modelled(rows: Rows, values: Dynamics) -> Array:
 
 
 def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
-    """Return the derivative of ``residual`` by each coordinate, the delay last.
+    """Return the derivative of ``residual`` with respect to each coordinate and, last, the delay.
 
     Args:
-        rows: of one joint.
-        values: of the parameters.
-        rates: derivatives of the values by the coordinates, which are the last axis.
+        rows: rows of one joint.
+        values: values of the parameters.
+        rates: derivatives of the values with respect to the coordinates, which are the last axis.
     """
     i, gain = rows.joint, values.gain[rows.joint]
     columns = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ rates.inertial

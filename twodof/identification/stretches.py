@@ -1,7 +1,8 @@
 """Recorded joint states as smooth signals on an even grid: positions, their derivatives, and efforts.
 
-A recording is divided at gaps. Positions are interpolated to an even grid and filtered without phase by a Butterworth
-filter, forward and backward, which leaves the band of the fit as it is; a quintic spline gives their derivatives.
+A recording is divided at gaps. Positions are interpolated to an even grid. A Butterworth filter, applied forward and
+backward, removes noise without a phase shift and does not change the band of the fit. A quintic spline gives the
+derivatives.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from ..plant.robot import Robot
 Array = NDArray[np.float64]
 
 BAND, MOST_BAND, LEAST_BAND = 0.1, 20.0, 2.0
-"""Band of the fit: part of the sampling rate, and Hz at most and at least."""
+"""Band of the fit: fraction of the sampling rate, and upper and lower bound in Hz."""
 MOST_NOISE = 3e-4
-"""Noise of accelerations within the band, part of their power: noise in regressors makes inertias too small."""
+"""Largest share of noise in the power of accelerations; noise in regressors makes inertias too small."""
 CUTOFF, ORDER = 2.5, 5
 """Cut-off of the filter of positions as a multiple of the band, and its order in one direction."""
-GAP = 3.5  # times the usual time between samples
-SHORTEST = 2.0  # s of a stretch without a gap
-EDGE = 0.15  # s at both ends of a stretch, where the filter knows one side alone
-HELD_OUT = 0.2  # of each recording, at its end
+GAP = 3.5  # multiple of the usual time between samples that counts as a gap
+SHORTEST = 2.0  # s: shortest stretch between gaps
+EDGE = 0.15  # s at both ends of a stretch that are not used, because the filter has samples on one side only
+HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
-LEAST_SPEED = 0.03  # of the highest: below it the ripple of the filter may hide that a joint rests
+LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
 
 
@@ -38,12 +39,12 @@ class Stretch(NamedTuple):
     """Samples without a gap on an even grid, n joints in the robot's order.
 
     Attributes:
-        bag: index of its recording.
-        t: s since the first sample of the bag, N.
-        measured: positions as recorded, N × n.
+        bag: index of the recording.
+        t: time since the first sample of the bag, s, N.
+        measured: recorded positions, N × n.
         q, v, a: smooth positions and their derivatives, N × n.
-        tau: efforts as recorded, N × n.
-        moving: whether a joint surely moves, N × n.
+        tau: recorded efforts, N × n.
+        moving: whether a joint certainly moves, N × n.
         band: highest frequency of the fit of each joint, Hz, n.
     """
 
@@ -63,16 +64,17 @@ class Stretch(NamedTuple):
         return float(self.t[1] - self.t[0])
 
     def part(self, rows: slice) -> Stretch:
-        """Return some of the samples."""
+        """Return a part of the samples."""
         cut = {name: getattr(self, name)[rows] for name in ("t", "measured", "q", "v", "a", "tau", "moving")}
         return self._replace(**cut)
 
 
 def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stretch], list[Stretch]]:
-    """Return the stretches to fit, and those held out, of recordings.
+    """Return the stretches of recordings for the fit, and the held-out stretches.
 
     Raises:
-        InputError: a recording does not fit the robot, is too short or too slow, or has values that are none.
+        InputError: a recording does not fit the robot, is too short, has too low a rate, or values that are not
+            finite.
     """
     fitted: list[Stretch] = []
     held: list[Stretch] = []
@@ -135,18 +137,18 @@ def _smooth(bag: int, t: Array, q: Array, tau: Array, h: float) -> Stretch:
     measured = q[: len(grid)] if even else make_interp_spline(t, q, 3)(grid)
     tau = tau[: len(grid)] if even else np.array([np.interp(grid, t, column) for column in tau.T]).T
     cutoff = CUTOFF * min(BAND / h, MOST_BAND)
-    # a line from end to end is taken out, so that a drift is not filtered
+    # a straight line between the ends is subtracted, so that drift is not filtered
     line = np.linspace(measured[0], measured[-1], len(grid))
     sos = butter(ORDER, cutoff, fs=1.0 / h, output="sos")
     smooth = line + sosfiltfilt(sos, measured - line, axis=0)
     spline = make_interp_spline(grid, smooth, 5)
     v, a = spline(grid, 1), spline(grid, 2)
-    # noise: white, of which the filter leaves out the part above its cut-off
+    # white noise, without the part above the filter's cut-off
     nyquist = 0.5 / h
     noise = np.std(measured - smooth, axis=0) / np.sqrt(1.0 - cutoff / nyquist)
     v_noise = noise * 2.0 * np.pi * np.sqrt(cutoff**3 / 3.0 / nyquist)
     moving = np.abs(v) > np.maximum(MOVES * v_noise, LEAST_SPEED * np.abs(v).max(axis=0))
-    # noise of accelerations below a frequency grows with its fifth power
+    # acceleration noise below a frequency grows with the fifth power of the frequency
     a_noise = noise * (2.0 * np.pi) ** 2 * np.sqrt(cutoff**5 / 5.0 / nyquist)
     power = np.maximum(np.var(a, axis=0) - a_noise**2, 1e-12)
     band = cutoff * (MOST_NOISE * power / np.maximum(a_noise**2, 1e-300)) ** 0.2
@@ -158,7 +160,7 @@ def _smooth(bag: int, t: Array, q: Array, tau: Array, h: float) -> Stretch:
 
 
 def _eroded(moving: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return True where a joint moves in one direction, at least ``reach`` samples from where it may not."""
+    """Return True for samples whose neighbours within ``reach`` all move in the same direction."""
     from scipy.ndimage import binary_erosion
 
     return np.asarray(binary_erosion(moving, np.ones((2 * reach + 1, 1)), border_value=1))
