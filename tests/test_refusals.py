@@ -293,7 +293,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
         (["run", "--set", "Kp=high"], "--set Kp=high: 'high' is not a number"),
         (["run", "--stop-time", "inf"], "stop time inf s"),
         (["run", "arm.fmu", "--native"], "leave it out with an FMU"),
-        (["run", "--frame", "a"], "--frame is of a URDF"),
+        (["run", "--frame", "a"], "--frame applies to a URDF"),
         (["build", "--gravity", "0", "1"], "--gravity"),
         (["build", "--lock", "a=b"], "--lock a=b: 'b' is not a number"),
         (["build", "--scalars"], "--scalars goes with --native --fmi 3"),

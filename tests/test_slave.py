@@ -409,7 +409,7 @@ def discard_a_step_without_ending_the_run(fmu):
     return False, rows["time"].tolist() == [0.0, 0.0]
 
 
-def tell_its_guid_from_another(fmu):
+def check_the_guid(fmu):
     try:
         return False, Driver(fmu, guid="another").initialise().step(0.0) == OK
     except Exception as error:  # FMPy's own
@@ -450,7 +450,7 @@ def answer_getstatus(fmu):
 CANNOT = (
     refuse_a_call,
     discard_a_step_without_ending_the_run,
-    tell_its_guid_from_another,
+    check_the_guid,
     refuse_a_null_pointer,
     keep_to_the_stop_time,
     answer_getstatus,

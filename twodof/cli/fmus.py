@@ -18,8 +18,7 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
     """Return the named FMU, or build and return that of the URDF or of the default arm."""
     of_urdf = is_robot(options.fmu)
     if options.frame is not None and not of_urdf:
-        what = "an FMU" if options.fmu else "none"
-        raise CommandLineError(f"--frame applies to a given URDF; leave it out with {what}")
+        raise CommandLineError("--frame applies to a URDF; name one, or leave it out")
     if options.fmu and not of_urdf:
         if options.native:
             raise CommandLineError("--native builds the default arm's FMU; leave it out with an FMU")
