@@ -226,7 +226,7 @@ static double first_release(Step *step, double before)
         return HUGE_VAL;
     const double instant = TIME_RESOLUTION * step->size;
     if (release_margin(step, instant, 0) < 0.0)
-        return instant; /* by rounding, which bisection would find by fifty looks */
+        return instant; /* a release by rounding, which bisection would find in fifty steps */
     memcpy(effort[0], step->effort[0], sizeof *effort);
     memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
     for (int k = 1; k < LOOKS; k++)

@@ -21,7 +21,7 @@ static void philox(uint32_t word[4], uint32_t k, uint32_t m)
     }
 }
 
-/* A product that no compiler fuses with a sum, whatever its flags. */
+/* A product that no compiler fuses with a sum, with any flags. */
 static double product(double a, double b)
 {
     volatile double rounded = a * b;

@@ -4,9 +4,9 @@
        q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − F s − h(q, v))
          = a + M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − F s − (M(q) a + h(q, v)))
 
-   for any a, s being the directions in which joints slip against their friction F. With a = q̈_cmd the
-   dynamics cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and
-   h, and in M̂ and ĥ where it is known; the armature is in both. */
+   for any a, where s are the directions in which joints slip against their friction F. With a = q̈_cmd, the dynamics
+   cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ
+   where it is known; the armature is in both. */
 #include "plant.h"
 
 #include <stddef.h>

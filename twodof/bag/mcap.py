@@ -32,7 +32,7 @@ MANY = 1000  # records outside chunks that are read at a time
 
 
 def mcap_messages(path: Path, budget: ReadBudget) -> Iterator[Batch]:
-    """Read all messages of a file; errors as of ``read_messages``."""
+    """Read all messages of a file; errors as in ``read_messages``."""
     tables = Tables()
     for records in _chunks(path, budget):
         yield from messages_in(path, records, tables, budget)
@@ -58,7 +58,7 @@ def _chunks(path: Path, budget: ReadBudget) -> Iterator[bytes]:
 
 
 def read_metadata(path: Path, name: str, key: str) -> str:
-    """Return an entry of a file's own metadata, "" where it has none; errors as of ``read_messages``."""
+    """Return an entry of a file's own metadata, or ""; errors as in ``read_messages``."""
     with refusing_damage(path):
         for _, content in _records(path, ReadBudget(), (METADATA,)):
             title, _, position = fields("sI", content, HEAD.size)

@@ -27,7 +27,7 @@ SOME = 1000  # rows in a group
 
 
 def sqlite3_messages(path: Path) -> Iterator[Batch]:
-    """Read all messages of a file; errors as of ``read_messages``."""
+    """Read all messages of a file; errors as in ``read_messages``."""
     try:
         with _database(path) as database:
             channels = _sqlite3_channels(path, database)
@@ -83,7 +83,7 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _unfinished(path: Path) -> list[Path]:
-    """Return the files that a killed writer leaves beside its database."""
+    """Return the files that a killed writer leaves next to its database."""
     files = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
     return [f for f in files if f.is_file() and not f.is_symlink() and f.stat().st_size]
 

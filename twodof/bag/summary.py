@@ -3,7 +3,7 @@
 The summary is at the end of a closed file, followed by its checksum:
 
     … | data end | schemas, channels, chunk indexes, statistics, … | footer | magic
-    footer   where the summary begins, where its offsets begin, CRC-32 of the summary and of these
+    footer   offset of the summary, offset of the summary offsets, CRC-32 of both
 
 Source: MCAP's specification. A file without a summary, or without its checksum, must be read completely.
 """

@@ -48,7 +48,7 @@ def place(options: argparse.Namespace) -> Keywords:
 
 
 def open_page(options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None) -> None:
-    """Print the URL of a page, and open it where there is a display."""
+    """Print the URL of a page, and open it if there is a display."""
     _print_remarks(remarks)
     what = f"{fmu}; " if fmu is not None else ""
     say(f"open  {url} ({what}Ctrl-C ends)")

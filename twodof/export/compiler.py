@@ -1,4 +1,4 @@
-"""Compile the C sources of an FMU, for every platform on any platform."""
+"""Compile the C sources of an FMU for all platforms, on any platform."""
 
 import hashlib
 import importlib.util

@@ -224,7 +224,7 @@ def hybrid_by_recursion(
 ) -> tuple[Array, Array]:
     """Return a and λ as ``hybrid_by_factors`` does, by articulated bodies without mimic joints.
 
-        n = A α + B a,  f = Bᵀ α + C a                    what a joint feels, inwards
+        n = A α + B a,  f = Bᵀ α + C a                    wrench at a joint, inwards
         U = I s,  D = sᵀ U + armature,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
         q̈ = (u − Uᵀ a)/D                                                 outwards
 

@@ -211,7 +211,7 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
 
 
 def problems_of(path: Path) -> list[str]:
-    """Return what is wrong with an FMU's description: its schema, variables, units and model structure.
+    """Return the faults of an FMU's description in schema, variables, units and model structure.
 
     Raises:
         FmuError: there is no description to read.

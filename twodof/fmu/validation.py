@@ -41,7 +41,7 @@ def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescrip
     if "fmiVersion" not in root.attrib:
         raise ValueError("it states no fmiVersion")
     check_description(root, xml)
-    alone = io.BytesIO()  # FMPy reads sources/buildDescription.xml too, whatever its size
+    alone = io.BytesIO()  # FMPy would also read sources/buildDescription.xml of any size
     with zipfile.ZipFile(alone, "w") as archive:
         archive.writestr("modelDescription.xml", xml)
     return fmpy.read_model_description(alone, validate=True, **more)

@@ -96,7 +96,7 @@ def page(
 
 
 def page_of(run: Experiment) -> bytes:
-    """Return the HTML of a run's FMU; errors as of ``page``."""
+    """Return the HTML of a run's FMU; errors as in ``page``."""
     fmu, sources = run.fmu, _sources(run.fmu)
     if not fmu.control or not sources:
         raise PageError(f"'{fmu.path}' has no plant in C, as native FMUs of this package have; build one with `native`")

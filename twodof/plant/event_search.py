@@ -186,7 +186,7 @@ def first_release(
 
     instant = TIME_RESOLUTION * step
     if margin(instant) < 0.0:
-        return instant  # by rounding, which bisection would find by fifty looks
+        return instant  # a release by rounding, which bisection would find in fifty steps
     inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
     margins = [at_ends[0], *inner, at_ends[1]]
     looks = [x * step for i in doubtful for x in _doubtful_minima([m[i] for m in margins])]

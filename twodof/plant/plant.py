@@ -99,7 +99,7 @@ class Plant(ControlledPlant):
         """Check the parameters and set the state to its start; return a line for each clamped value.
 
         Raises:
-            ParameterError: naming the parameter and what it must be.
+            ParameterError: a parameter is invalid; the message names it and its valid values.
         """
         self._check_parameters()
         self.prepare()

@@ -25,7 +25,7 @@ from .words import common_settings, outcome
 from .workspace import views
 
 # isort: split
-from matplotlib.backends.backend_agg import FigureCanvasAgg  # where it is missing, twodof.figure says so
+from matplotlib.backends.backend_agg import FigureCanvasAgg  # figure raises if matplotlib is missing
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 

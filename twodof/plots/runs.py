@@ -24,7 +24,7 @@ from .words import common_settings, labels, outcome, summary
 from .workspace import View, views, workspace_title
 
 # isort: split
-from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
+from matplotlib.axes import Axes  # figure raises if matplotlib is missing
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D

@@ -11,7 +11,7 @@ from .strokes import ALARM, GREY, INK, PALE, SMALLEST_RANGE, Stroke, downsampled
 from .track import Task, Track
 
 # isort: split
-from matplotlib.path import Path as Polyline  # where it is missing, twodof.figure says so
+from matplotlib.path import Path as Polyline  # figure raises if matplotlib is missing
 
 MANY_TARGETS = 12
 MANY_CORNERS = 20_000  # points of a path; each takes about 20 bytes in SVG and PDF

@@ -14,7 +14,7 @@ from .dds import dds_qos, dds_topic
 from .messages import JOINT_STATE, POINT, POSE, STREAM
 
 # isort: split
-from cyclonedds import builtin, core, domain, sub  # where missing, dds says so
+from cyclonedds import builtin, core, domain, sub  # dds raises if it is missing
 
 LOG = logging.getLogger(__name__)
 ORDERS = {"/pause": "std_msgs/msg/Bool", "/step": "std_msgs/msg/UInt32"}

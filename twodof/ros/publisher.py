@@ -22,7 +22,7 @@ from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_n
 from .network import Network, OpenDomain, network_of_environment, open_domain
 
 # isort: split
-from cyclonedds import core, domain, pub  # where missing, dds says so
+from cyclonedds import core, domain, pub  # dds raises if it is missing
 
 LOG = logging.getLogger(__name__)
 JOINT_COMMANDS, TARGET_COMMAND, CLICKED_POINT = "joint_commands", "target_command", "clicked_point"

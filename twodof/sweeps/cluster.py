@@ -45,7 +45,7 @@ class JobPlugin(WorkerPlugin):  # type: ignore[misc]
                 self._runner.__exit__(None, None, None)
 
     def run_all(self, points: Sequence[Point]) -> tuple[list[Row], float]:
-        """Return the rows of some points, and the time they took, s."""
+        """Return the rows of some points, and their duration, s."""
         with self._lock:
             if self._runner is None:
                 self._runner = Runner(self._job)
@@ -61,7 +61,7 @@ def run_batch(name: str, points: Sequence[Point]) -> tuple[list[Row], float]:
 class Cluster:
     """The workers of a cluster, as a context that needs at least one of them.
 
-    A thread talks to Dask, because Dask can wait for ever for a peer that does not answer.
+    A thread communicates with Dask, because Dask can wait without end for a peer that does not answer.
 
     Args:
         job: common settings of all runs.

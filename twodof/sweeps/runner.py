@@ -114,7 +114,7 @@ class Runner:
         return judge
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
-        """Return the rows of some points, and the time they took, s; errors as of ``run``."""
+        """Return the rows of some points, and their duration, s; errors as in ``run``."""
         begin = time.perf_counter()
         return [self.run(point) for point in points], time.perf_counter() - begin
 
