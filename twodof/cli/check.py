@@ -1,4 +1,4 @@
-"""Verb check: check an FMU of any maker against the FMI standard."""
+"""Verb check: check an FMU of any vendor against the FMI standard."""
 
 import argparse
 
@@ -8,7 +8,7 @@ from .printing import busy, print_json, print_table, say
 
 def add(check: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    check.description = "Check an FMU of any maker; exit status 1 if a row fails."
+    check.description = "Check an FMU of any vendor; exit status 1 if a row fails."
     check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0")
     check.add_argument(
         "--with",

@@ -26,7 +26,7 @@ def add(fit: argparse.ArgumentParser) -> None:
         " and fit.json into a folder. The last fifth of each bag is held out."
     )
     option = fit.add_argument
-    option("robot", type=Path, metavar="URDF", help="URDF or xacro file with the values to begin with")
+    option("robot", type=Path, metavar="URDF", help="URDF or xacro file with the initial values")
     option("bags", nargs="+", type=not_empty, metavar="BAG", help="bags of the robot")
     option(
         "--free",

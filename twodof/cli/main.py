@@ -28,7 +28,7 @@ VERBS = {
     run: "simulate an FMU and write a bag",
     publish: "step an FMU in real time on a ROS 2 network",
     layouts: "write layouts of a robot for RViz, PlotJuggler and Foxglove",
-    check: "check an FMU of any maker against the standard",
+    check: "check an FMU of any vendor against the standard",
     info: "show the contents of an FMU, a bag or a sweep",
     linearise: "show the linear model of a native FMU about an operating point",
     fit: "fit a robot's masses and friction to bags of its motion",
