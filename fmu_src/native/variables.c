@@ -1,4 +1,4 @@
-/* Getting and setting variables. A refused call changes no variable. Each reference stands for as many values as PLACE
+/* Getting and setting variables. A refused call changes no variable. Each reference stands for as many values as INDEX
    says, in total n_values. */
 #include <math.h>
 #include <stddef.h>
@@ -13,7 +13,7 @@ static const char *const TYPE_NAME[] = {REAL_NAME, "Boolean", INTEGER_NAME};
 
 static size_t size_of(Reference vr)
 {
-    return (size_t)(PLACE[vr + 1] - PLACE[vr]);
+    return (size_t)(INDEX[vr + 1] - INDEX[vr]);
 }
 
 /* True if all references are variables of a type, and have the given total number of values. */
@@ -31,11 +31,11 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
                    call_name(call), (unsigned long)vr[i]);
             return 0;
         }
-        const int place = PLACE[vr[i]];
+        const int place = INDEX[vr[i]];
         const Type actual = place >= FIRST_BOOLEAN ? BOOLEAN : place >= FIRST_INTEGER ? INTEGER : REAL;
         if (actual != type) {
             report(instance, ERROR, "%s: %s is of type %s", call_name(call),
-                   VARIABLE_NAME[PLACE[vr[i]]], TYPE_NAME[actual]);
+                   VARIABLE_NAME[INDEX[vr[i]]], TYPE_NAME[actual]);
             return 0;
         }
         wanted += size_of(vr[i]);
@@ -154,14 +154,14 @@ static Status get_values(void *component, Call call, const Reference vr[], size_
     if (!instance || !known(instance, call, type, vr, count, values, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
             if (k >= FIRST_OUTPUT && k < FIRST_PARAMETER) {
                 const Status status = update(instance, k);
                 if (status != OK)
                     return status;
             }
     for (size_t i = 0; i < count; i++)
-        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++, n++) {
+        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++, n++) {
             const double number = instance->state.plant.value[k];
             if (type == REAL)
                 ((double *)values)[n] = number;
@@ -194,11 +194,11 @@ static Status set_values(void *component, Call call, const Reference vr[], size_
     if (!instance || !known(instance, call, type, vr, count, values, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
             if (!accepts(instance, call, k, number_in(type, values, checked++)))
                 return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
             set(instance, k, number_in(type, values, n++));
     return OK;
 }
@@ -210,7 +210,7 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
 {
     int wants = 0;
     for (size_t i = 0; i < n_unknown; i++) {
-        const int k = PLACE[unknown[i]];
+        const int k = INDEX[unknown[i]];
         if (k < FIRST_OUTPUT || k >= END_OF_RATES) {
             report(instance, ERROR, "%s: %s is not computed, it has no derivative", call_name(call),
                    VARIABLE_NAME[k]);
@@ -219,9 +219,9 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
         wants |= k >= DER_Q ? WANTS_RATES : k >= Q_MEAS ? WANTS_SAMPLE : k >= TAU ? WANTS_TAU : k >= X ? WANTS_X : 0;
     }
     for (size_t i = 0; i < n_given; i++)
-        if (PLACE[given[i]] >= X) {
+        if (INDEX[given[i]] >= X) {
             report(instance, ERROR, "%s: %s is neither a state nor an input", call_name(call),
-                   VARIABLE_NAME[PLACE[given[i]]]);
+                   VARIABLE_NAME[INDEX[given[i]]]);
             return -1;
         }
     if (!instance->state.initialised && initialise(instance, 0) != OK)
@@ -238,7 +238,7 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
 static const char *culprit(const Reference vr[], size_t count, const double value[])
 {
     for (size_t i = 0; i < count; i++)
-        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
             if (!isfinite(*value++))
                 return VARIABLE_NAME[k];
     return NULL;
@@ -262,16 +262,16 @@ static Status directional_derivative(void *component, const Reference unknown[],
     if (wants < 0)
         return ERROR;
     for (size_t i = 0; i < n_given; i++)
-        for (int k = PLACE[given[i]]; k < PLACE[given[i] + 1]; k++)
+        for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++)
             change[k] += *seed++;
     const Stops *stops = &instance->state.stops;
     differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants, change,
                   derivative);
     for (size_t i = 0; i < n_unknown; i++)
-        if ((name = culprit(&unknown[i], 1, &derivative[PLACE[unknown[i]]])))
+        if ((name = culprit(&unknown[i], 1, &derivative[INDEX[unknown[i]]])))
             return report(instance, DISCARD, "%s: that of %s is not finite", call_name(call), name);
     for (size_t i = 0; i < n_unknown; result += size_of(unknown[i++]))
-        memcpy(result, &derivative[PLACE[unknown[i]]], size_of(unknown[i]) * sizeof *result);
+        memcpy(result, &derivative[INDEX[unknown[i]]], size_of(unknown[i]) * sizeof *result);
     return OK;
 }
 
@@ -294,10 +294,10 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
     if (wants < 0)
         return ERROR;
     for (size_t i = 0; i < n_unknown; i++)
-        for (int k = PLACE[unknown[i]]; k < PLACE[unknown[i] + 1]; k++)
+        for (int k = INDEX[unknown[i]]; k < INDEX[unknown[i] + 1]; k++)
             weight[k] += *seed++;
     for (size_t i = 0; i < n_given; i++) /* a column of the Jacobian for each value */
-        for (int k = PLACE[given[i]]; k < PLACE[given[i] + 1]; k++) {
+        for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++) {
             double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
             change[k] = 1.0;
             const Stops *stops = &instance->state.stops;
@@ -312,7 +312,7 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
                               VARIABLE_NAME[k]);
         }
     for (size_t i = 0; i < n_given; result += size_of(given[i++]))
-        memcpy(result, &sum[PLACE[given[i]]], size_of(given[i]) * sizeof *result);
+        memcpy(result, &sum[INDEX[given[i]]], size_of(given[i]) * sizeof *result);
     return OK;
 }
 #endif

@@ -20,7 +20,7 @@ static Instance *create(void)
 static Reference of_place(int place)
 {
     Reference vr = 1;
-    while (PLACE[vr] != place)
+    while (INDEX[vr] != place)
         vr++;
     return vr;
 }
@@ -65,7 +65,7 @@ static fmi3Status variables(Instance *c)
     const Reference *place = pick(30) ? vr : NULL;
     fmi3Status status = fmi3Error;
     for (size_t i = 0, k = 0; i < count && right; k += size_of(vr[i++]))
-        if (PLACE[vr[i]] == MAX_STEP && k < size && !(real[k] < 0.0) && real[k] < 1e-3)
+        if (INDEX[vr[i]] == MAX_STEP && k < size && !(real[k] < 0.0) && real[k] < 1e-3)
             real[k] = 1e-3; /* the master's choice alone: how long a step takes */
     switch (pick(8)) {
     case 0: status = fmi3GetBoolean(c, place, count, truth, size); break;

@@ -92,7 +92,7 @@ def call(options: argparse.Namespace) -> int:
     if options.stock and (options.urdf or options.robot):
         raise CommandLineError("--robot names an installed robot; leave out the URDF, or --robot")
     if options.urdf and options.robot:
-        raise CommandLineError("a URDF is given twice, by its place and with --urdf")
+        raise CommandLineError("a URDF is given twice, as an argument and with --urdf")
     check_company(options, needs={"--mesh-dir": "a URDF"}, excludes={"--no-meshes": "--mesh-dir"})
     if options.orientation and options.control != "task":
         raise CommandLineError(f"--orientation goes with --control task, not {options.control}")

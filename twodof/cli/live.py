@@ -6,7 +6,7 @@ from .fmus import fast_fmu
 from .options import OF_A_PAGE, add_fmu, add_options, add_output, parse_settings
 from .printing import print_next, quote, say
 from .signals import INTERRUPTED, asked_to_stop
-from .view import open_page, place
+from .view import address, open_page
 
 
 def add(live: argparse.ArgumentParser) -> None:
@@ -28,7 +28,7 @@ def call(options: argparse.Namespace) -> int:
             fmu,
             asked,
             lambda url: open_page(options, url, fmu=fmu),
-            **place(options),
+            **address(options),
             step=options.step,
             settings=settings,
             bag=options.output,

@@ -38,11 +38,11 @@ def call(options: argparse.Namespace) -> int:
         say(f"film  {options.export}" if film else f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:
-        view(options.bag, asked, lambda url, remarks: open_page(options, url, remarks), **place(options), **robot)
+        view(options.bag, asked, lambda url, remarks: open_page(options, url, remarks), **address(options), **robot)
     return 0
 
 
-def place(options: argparse.Namespace) -> Keywords:
+def address(options: argparse.Namespace) -> Keywords:
     """Return the host and port options of a served page."""
     return {key: value for key, value in given_options(options, "host", "port").items() if value is not None}
 

@@ -36,9 +36,9 @@ def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
     terminals = {"targets": targets, "joints": {"q", "v", "tau"}, "forces": set(DISTURBANCES)}
     root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
     graphic = ET.SubElement(root, "GraphicalRepresentation")
-    place = {"x1": "-15", "y1": "-10", "x2": "15", "y2": "10"}  # the aspect ratio of the icon
-    ET.SubElement(graphic, "CoordinateSystem", place, suggestedScalingFactorTo_mm="1")
-    ET.SubElement(graphic, "Icon", place)
+    extent = {"x1": "-15", "y1": "-10", "x2": "15", "y2": "10"}  # the aspect ratio of the icon
+    ET.SubElement(graphic, "CoordinateSystem", extent, suggestedScalingFactorTo_mm="1")
+    ET.SubElement(graphic, "Icon", extent)
     parent = ET.SubElement(root, "Terminals")
     for name, members in terminals.items():
         terminal = ET.SubElement(parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name])

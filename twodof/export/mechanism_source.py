@@ -153,4 +153,4 @@ def _variables(name: str, count: int) -> Array:
 
 def _elements(name: str, values: Array) -> dict[str, Value]:
     """Return each element of an array by its name in C."""
-    return {name + "".join(f"[{i}]" for i in place): value for place, value in np.ndenumerate(values)}
+    return {name + "".join(f"[{i}]" for i in index): value for index, value in np.ndenumerate(values)}

@@ -60,7 +60,7 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     return ET.tostring(tree, encoding="unicode") + "\n", files
 
 
-def places_of(folder: Path, mesh_dir: Path | None) -> list[Path]:
+def mesh_folders(folder: Path, mesh_dir: Path | None) -> list[Path]:
     """Return the folders from which a URDF may read files: ``mesh_dir``, its own folder and its package.
 
     The URDF's package is the nearest parent folder with a package.xml. A parent folder of the package's name is not
@@ -73,7 +73,7 @@ def places_of(folder: Path, mesh_dir: Path | None) -> list[Path]:
 
 def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
     """Return the file of a mesh, links resolved, inside one of the allowed folders."""
-    own, places = folder.resolve(), places_of(folder, mesh_dir)
+    own, folders = folder.resolve(), mesh_folders(folder, mesh_dir)
     scheme, separator, rest = uri.partition("://")
     if not separator or scheme == "file":
         name = unquote(rest) if separator else uri
@@ -87,10 +87,10 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
         candidates = [root.joinpath(*parts[i:]) for root in roots for i in range(most)]
     for candidate in candidates:
         path = candidate.resolve()
-        if any(path.is_relative_to(place) for place in places) and path.is_file():
+        if any(path.is_relative_to(root) for root in folders) and path.is_file():
             return path
     if any(os.path.lexists(candidate) for candidate in candidates):
-        where = " or ".join(f"'{place}'" for place in dict.fromkeys(places))
+        where = " or ".join(f"'{root}'" for root in dict.fromkeys(folders))
         raise BuildError(
             f"mesh '{uri}' not found in {where}, and it may come from nowhere else; give the folder"
             " of the meshes, or of their packages, with `mesh_dir`"

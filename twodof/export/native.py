@@ -92,10 +92,10 @@ def _ranges(groups: Sequence[str]) -> str:
 
 def _references(table: Sequence[Variable], arrays: bool) -> str:
     """Return value references of variables or whole vectors; they begin with 1, as some importers require."""
-    places = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
+    indices = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
     return (
-        "/* The values of a reference, from 1 on: from PLACE[vr] to before PLACE[vr + 1]. */\n"
-        f"enum {{ N_REFERENCES = {len(places)} }};\n" + _table("int PLACE", [0, *places, len(table)])
+        "/* The values of a reference, from 1 on: from INDEX[vr] to before INDEX[vr + 1]. */\n"
+        f"enum {{ N_REFERENCES = {len(indices)} }};\n" + _table("int INDEX", [0, *indices, len(table)])
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import BuildError, choice, kind_of, no_such
 from ..files import read_file, refusing
 from ..plant.urdf import MAX_URDF, RobotError, Urdf, read_urdf
-from .mesh_files import places_of
+from .mesh_files import mesh_folders
 from .xacro_file import expand
 
 DEFAULT_FRAME = "EndEffector"
@@ -20,7 +20,7 @@ DEFAULT_FRAME = "EndEffector"
 def read_text(path: Path, mesh_dir: Path | None) -> str:
     """Return the text of a URDF or of an expanded xacro file; raise BuildError if the file cannot be read."""
     if path.suffix == ".xacro":
-        return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
+        return expand(path, mesh_folders(path.parent, mesh_dir), MAX_URDF)
     if path.is_dir() or not path.exists():
         raise BuildError(no_such("URDF", path))
     with refusing(BuildError, f"read the URDF '{path}'"):
@@ -100,9 +100,9 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
                 f"joint '{name}' cannot be locked at {value:g}: its limits are {joint.low:g} and {joint.high:g}"
             )
         rotated = Rotation.from_euler("xyz", joint.rpy)
-        place = np.array(joint.xyz)
+        xyz = np.array(joint.xyz)
         if joint.prismatic:
-            place = place + rotated.apply(np.array(joint.axis) * value)
+            xyz = xyz + rotated.apply(np.array(joint.axis) * value)
         else:
             rotated = rotated * Rotation.from_rotvec(np.array(joint.axis) * value)
         for tag in ("origin", "mimic", "limit", "dynamics"):
@@ -112,5 +112,5 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # in gimbal lock, any pair of roll and yaw is correct
             rpy = rotated.as_euler("xyz")
-        ET.SubElement(element, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
+        ET.SubElement(element, "origin", xyz=" ".join(map(repr, xyz.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
     return ET.tostring(urdf.tree, encoding="unicode")

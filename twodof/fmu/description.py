@@ -287,8 +287,8 @@ def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:
 
 def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
     """Return the robot's facts from the vendor annotation; empty for third-party FMUs."""
-    places = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
-    robots = (root.find(f"{place}/Robot") for place in places)
+    paths = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
+    robots = (root.find(f"{path}/Robot") for path in paths)
     robot = next((robot for robot in robots if robot is not None), ET.Element("Robot"))
     return {
         "robot": robot.get("name", ""),
@@ -308,8 +308,8 @@ def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
     if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
         raise FmuError(f"{variable.name} has {len(starts)} start values, not one or one an element")
     inner = re.fullmatch(r"der\((.*)\)", variable.name)
-    for i, place in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
-        index = f"[{','.join(map(str, place))}]"
+    for i, indices in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
+        index = f"[{','.join(map(str, indices))}]"
         name = f"der({inner[1]}{index})" if inner else variable.name + index
         start = starts[i % len(starts)]
         yield Scalar(name, *rest, start, text, variable.valueReference, i)

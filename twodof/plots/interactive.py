@@ -208,8 +208,8 @@ def over_time(tracks: Sequence[Track]) -> Chart:
         layout["annotations"].append(_heading(heading, top))
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):
             hover = "none" if stroke.kind else "skip"
-            place = {"xaxis": "x", "yaxis": f"y{row}", "hoverinfo": hover}
-            data.append({**_trace(stroke.thinned(most)), **place})
+            panel_axes = {"xaxis": "x", "yaxis": f"y{row}", "hoverinfo": hover}
+            data.append({**_trace(stroke.thinned(most)), **panel_axes})
     return {"data": data, "layout": layout}
 
 

@@ -79,12 +79,12 @@ def difference(first: Track, other: Track) -> str:
     Positions of the second run are interpolated linearly at the times of the first.
     """
     both = first.t <= other.t[-1]
-    t, places = first.t[both], {joint.name: joint.q for joint in other.joints}
+    t, positions = first.t[both], {joint.name: joint.q for joint in other.joints}
     found = []
     for joint in first.joints:
-        if joint.name in places and len(t):
+        if joint.name in positions and len(t):
             with np.errstate(invalid="ignore"):  # difference of two infinities
-                off = np.abs(joint.q[both] - np.interp(t, other.t, places[joint.name]))
+                off = np.abs(joint.q[both] - np.interp(t, other.t, positions[joint.name]))
             if (lost := ~np.isfinite(off)).any():
                 lost_at = f"{joint.name} is not finite at {number(t[lost.argmax()])} s"
                 return f"cannot be told from '{first.name}': {lost_at}"

@@ -162,9 +162,9 @@ class Messages:
             self.topics[TRUE_STATES] = Topic(JOINT_STATE, STREAM)
         if self._scene is not None:
             m, poses = len(run.fmu.vector("x_des")), bool(run.fmu.vector("quat_des"))
-            place = Layout(Stamp(), run.fmu.root, Numbers(7 if poses else 3))
-            layouts |= {TRANSFORMS: _tf_layout(self._scene.moving), TARGET: place}
-            layouts |= {END_EFFECTOR: place}
+            point = Layout(Stamp(), run.fmu.root, Numbers(7 if poses else 3))
+            layouts |= {TRANSFORMS: _tf_layout(self._scene.moving), TARGET: point}
+            layouts |= {END_EFFECTOR: point}
             self.topics |= SCENE_TOPICS
             if poses:
                 self.topics |= dict.fromkeys((TARGET, END_EFFECTOR), Topic(POSE, STREAM))
