@@ -43,7 +43,7 @@ UNSOUND = "invalid FMU state"
 
 
 def import_plant(resources: Path, site_packages: list[str]):
-    """Import this FMU's plant module; name the remedy where a package is missing."""
+    """Import this FMU's plant module; if a package is missing, name the remedy."""
     for package in sys.modules.keys() & {PACKAGE, f"{PACKAGE}.plant"}:  # an earlier instance's
         sys.modules[package].__path__ = [str(resources.joinpath(*package.split(".")))]
     with suppress(ModuleNotFoundError):

@@ -63,8 +63,8 @@ typedef enum { BOTH_KINDS, MODEL_EXCHANGE, CO_SIMULATION } Kind;
 
 typedef enum {
     INSTANTIATED, INITIALIZATION,
-    STEP, STEP_FAILED,      /* of co-simulation */
-    EVENT, CONTINUOUS_TIME, /* of Model Exchange */
+    STEP, STEP_FAILED,      /* in co-simulation */
+    EVENT, CONTINUOUS_TIME, /* in Model Exchange */
     TERMINATED, N_PHASES
 } Phase;
 

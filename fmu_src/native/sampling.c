@@ -12,7 +12,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { MOST_PERIODS = 10 }; /* of a delay */
+enum { MOST_PERIODS = 10 }; /* longest delay */
 
 /* Discrete state of the controller and its sensors. The acting effort is the plant's output tau. */
 typedef struct {

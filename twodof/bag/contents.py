@@ -45,12 +45,12 @@ def read_messages(file: Path, budget: ReadBudget) -> Iterator[Batch]:
     """Read all messages of a file; the messages of a channel are in order.
 
     Args:
-        file: one of a bag's.
-        budget: of the bag.
+        file: a storage file of a bag.
+        budget: read budget of the bag.
 
     Raises:
-        DamageError: where the file ends in the middle or is not sound.
-        OSError: it cannot be read.
+        DamageError: the file is truncated or damaged.
+        OSError: the file cannot be read.
     """
     mcap = file.suffix == ".mcap"
     with refusing_damage(file):

@@ -144,7 +144,7 @@ def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read],
 
 
 def _followed(commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str) -> Changes:
-    """Return inputs with which joints follow trajectories, at the steps where they change."""
+    """Return inputs with which joints follow trajectories, at the steps at which they change."""
     joints = {name: i for i, name in enumerate(fmu.joints)}
     read = _read(commands, begin, lambda came, _, data: read_trajectory(data, joints, came, begin), bag)
     trajectories = [trajectory for _, trajectory in read]

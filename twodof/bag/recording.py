@@ -164,7 +164,7 @@ class Recording:
         return self.held("quat_des", 4)
 
     def held(self, group: str, size: int) -> Array:
-        """Return a vector of inputs in effect up to each sample, N × size; N × 0 where unknown."""
+        """Return a vector of inputs in effect up to each sample, N × size; N × 0 if unknown."""
         names = [f"{group}[{i + 1}]" for i in range(size)]
         if not size or names[0] not in self.schedule[0][1] or KNOWN_UNTIL in self.provenance:
             return np.empty((len(self.stamps), 0))

@@ -42,7 +42,7 @@ BATCH_SIZE = 512 * 1024  # bytes; below the 1 MiB at which rosbags cuts a chunk
 RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("times", "<u8", 2)])
 """Header of a message record in MCAP."""
 MESSAGE_INDEX = 7  # opcode
-CHECKSUM = struct.Struct("<I8s")  # of the summary, and the magic: the end of a file
+CHECKSUM = struct.Struct("<I8s")  # end of a file: checksum of the summary, magic
 FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # offsets of summary and summary offsets; checksum, magic
 
 

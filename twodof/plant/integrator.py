@@ -299,7 +299,7 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     short_time = SHORT_CHATTER_TIME * chatter_time
     joint_hold, slide, stuck = Hold(), Slide(), [Hold() for _ in range(n)]
     left, slipped = [-inf] * n, [-inf] * n  # last release and start of slip
-    soon, longest = chatter_time, chatter_time  # of the holds of joints at limits
+    soon, longest = chatter_time, chatter_time  # times of the holds at limits
     event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):

@@ -28,7 +28,7 @@ def apply_pseudo_inverse(
         rows: J, m rows of n.
         b: m values.
         rcond: in [0, 1).
-        rank: of J⁺; None keeps σ > rcond·σ_max, the rule of ``numpy.linalg.pinv``.
+        rank: rank of J⁺; None keeps σ > rcond·σ_max, the rule of ``numpy.linalg.pinv``.
 
     Returns:
         The least-squares solution of smallest norm, n values; the rank; and the rank's margin, which is
@@ -87,7 +87,7 @@ def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
     Args:
         ratios: σ/σ_max in descending order.
         rcond: in [0, 1).
-        rank: of J⁺.
+        rank: rank of J⁺.
     """
     margins = [1.0]
     if rank > 0:

@@ -29,7 +29,7 @@ class Robot:
         joints: names of the n joints in the model's order.
         prismatic: for each joint, True if its coordinate is a length (m), False for an angle (rad).
         q_min, q_max: position limits, rad or m, including limits of joints that mimic it; ∓UNBOUNDED without one.
-        effort: effort limits, N·m or N; infinite where the URDF has 0 or none.
+        effort: effort limits, N·m or N; infinite if the URDF has 0 or none.
         damping: viscous joint damping D, N·m·s/rad or N·s/m, including that of joints that mimic it.
         friction: Coulomb friction, N·m or N, including that of joints that mimic it.
         frame: name of the task frame, and its Pinocchio index ``frame_id``.

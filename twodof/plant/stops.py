@@ -41,8 +41,8 @@ class Stops:
     """Stops and friction of a robot, and the joints that they hold at rest.
 
     Args:
-        limits: of the joints.
-        friction: of the joints, N·m or N, n values.
+        limits: position limits of the joints.
+        friction: Coulomb friction of the joints, N·m or N, n values.
         inverse_mass: function that returns M⁻¹; called only with friction or rigid stops.
         rigid: whether stops have a reaction.
 

@@ -53,7 +53,7 @@ class Panel(NamedTuple):
 
 
 def title(tracks: Sequence[Track]) -> str:
-    """Return the names of the robots, or of the bags where robots are unknown."""
+    """Return the names of the robots, or of the bags if robots are unknown."""
     robots = dict.fromkeys(t.motion.robot for t in tracks if t.motion and t.motion.robot)
     return ", ".join(robots or dict.fromkeys(track.name for track in tracks))
 

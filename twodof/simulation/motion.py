@@ -17,7 +17,7 @@ LINEAR = 0.05  # residual, relative to the second differences, above which the m
 VISIBLE = 1e-3  # fraction of a signal's range below which swings are not counted
 LASTING = 0.01  # fraction of the scale: a smaller amplitude at the end counts as rest
 UNEVEN = 1e-6  # fraction of the duration by which uneven times differ from evenly spaced ones
-GROWTH = 1.5  # of the amplitude from the third to the last quarter of the run
+GROWTH = 1.5  # ratio of the amplitudes in the last and the third quarter
 
 
 class Ringing(NamedTuple):

@@ -102,7 +102,7 @@ class Runner:
         )
 
     def _judged(self, run: Experiment, number: int) -> Judge:
-        """Simulate, with a bag where the job requests one; return the judge of all samples."""
+        """Simulate, with a bag if the job requests one; return the judge of all samples."""
         if self._job.bags is not None:
             from ..bag.writer import Bag  # rosbags takes half a second to import
 
