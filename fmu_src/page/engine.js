@@ -1,6 +1,6 @@
 /** The FMU's engine, compiled to WebAssembly: the functions of page.c. */
 
-const ERROR = 2; // of FMI's status: discard is 2, error 3, fatal 4
+const ERROR = 2; // smallest FMI status of a failure: discard 2, error 3, fatal 4
 
 export class Engine {
   /** @param {WebAssembly.Instance} instance */
