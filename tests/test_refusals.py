@@ -313,7 +313,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
         (["sweep", "arm.fmu", "--grid", "Kp=1:2:2", "--seed", "0"], "without --random"),
         (["sweep", "arm.fmu", "--workers", "1", "--scheduler", "tcp://a"], "--workers has no effect with --scheduler"),
         (["plot"], "BAG"),
-        (["view", "bag", "--export", "a.html", "--port", "0"], "beside --export"),
+        (["view", "bag", "--export", "a.html", "--port", "0"], "no effect with --export"),
         *(
             ([verb, option, ""], f"argument {option}: it is empty")
             for verb, option in (

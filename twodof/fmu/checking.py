@@ -67,7 +67,7 @@ class Check:
 
 
 def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
-    """Check an FMU of any maker: description, states, steps, derivatives, order of calls, and references it carries.
+    """Check an FMU of any vendor: description, states, steps, derivatives, order of calls, and its references.
 
     The FMU runs in a child process, whose crash is a failed row. An FMU is a program: check only an FMU that you would
     run.
@@ -77,8 +77,8 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
         tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos" or "fmuloader".
 
     Raises:
-        FmuError: the file is missing, no FMU, unsafe to unzip, or has no co-simulation.
-        InputError: a tool is not installed, or the FMU carries no references for it.
+        FmuError: the file is missing, is no FMU, is unsafe to unzip, or has no co-simulation.
+        InputError: a tool is not installed, or the FMU contains no references for it.
     """
     path = Path(fmu)
     require(tools)
@@ -101,7 +101,7 @@ def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
     """Return the names of the rows of references, one for each experiment and tool."""
     try:
         names = [reference.name for reference in references_of(fmu)]
-    except FmuError:  # which the row then has
+    except FmuError:  # the row of the references has the error
         names = [""]
     if tools and not names:
         raise InputError(f"'{fmu.path}' carries no references to run; build one with `reference=True`")
