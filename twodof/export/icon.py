@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from ..plant.urdf import Urdf
 
 if TYPE_CHECKING:
-    from ..plant.robot import Robot  # which imports Pinocchio
+    from ..plant.robot import Robot  # this imports Pinocchio
 
 Array = NDArray[np.float64]
-WIDTH, HEIGHT, EDGE = 300, 200, 32  # pixels; the edge has no links
-GRAIN = 16  # parts of a pixel to which points are rounded, so that all machines draw the same
+WIDTH, HEIGHT, EDGE = 300, 200, 32  # pixels; the edge is free of links
+GRAIN = 16  # points are rounded to this fraction of a pixel, so that all machines draw the same picture
 INK, SLATE, ORANGE, WHITE, PAPER = (31, 41, 51), (84, 101, 124), (245, 140, 36), (255, 255, 255), (244, 246, 248)
 CORNER = 12.0  # radius of the block's corners, pixels
 THICK, THIN = 7.0, 4.0  # half the width of the first and the last link, pixels
@@ -51,7 +51,7 @@ def icon(urdf: Urdf, robot: Robot, q: Sequence[float]) -> bytes:
 
 
 def side_view(points: Sequence[Sequence[Array]]) -> tuple[list[Array], str]:
-    """Return lines, N × 3, as seen along the axis in which they extend least, N × 2, and the other axes' letters."""
+    """Return the view (N × 2) of lines (N × 3) along the axis of their smallest extent, and the other axes' letters."""
     lines = [np.array(line) for line in points]
     axes = sorted(np.argsort(np.ptp(np.concatenate(lines), axis=0), kind="stable")[1:])
     return [line[:, axes] for line in lines], "".join("xyz"[axis] for axis in axes)

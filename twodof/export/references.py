@@ -1,12 +1,13 @@
-"""Reference trajectories that an FMU carries, so that an importer can be checked with it.
+"""Reference trajectories in an FMU, with which an importer can be checked.
 
-Two experiments of 0.5 s, from the start position: "move" follows targets, or efforts of a controller; "push" has
-external efforts too. Inputs are constant over HOLD steps, and references are of samples at which no input changes:
-then it does not matter whether an importer sets inputs before or after it reads outputs, or interpolates them.
+There are two experiments of 0.5 s from the start position. In "move", the robot follows targets, or efforts of a
+controller. In "push", there are also external efforts. Inputs are constant over HOLD steps, and references are samples
+at which no input changes. Therefore the result does not depend on whether an importer sets inputs before or after it
+reads outputs, or interpolates them.
 
 Each sample is solved twice, by Dormand and Prince's order 8 and by Radau IIA of order 5 (Hairer, Norsett & Wanner,
 "Solving ODEs" I and II), with Pinocchio's equations of motion. Where a closed form exists it is the reference, and both
-solvers must agree with it. Form: FMI-LS-REF 1.0.0-beta.1 and MA-HS-Experiments, with SSP 1.0's parameter sets.
+solvers must agree with it. The format is FMI-LS-REF 1.0.0-beta.1 with MA-HS-Experiments and parameter sets of SSP 1.0.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ STEPS, STEP, HOLD = 50, 0.01, 5  # communication steps, s, steps
 ROWS = [k for k in range(1, STEPS + 1) if k % HOLD]  # samples of the references
 SWING, ACCELERATION = 0.05, 0.5  # rad or m of each joint, rad/s² or m/s²
 TIGHT = {"rtol": 1e-11, "atol": 1e-13}
-SOLVERS = {"DOP853": 1e-13, "Radau": 1e-11}  # SciPy's, with their tolerances
+SOLVERS = {"DOP853": 1e-13, "Radau": 1e-11}  # SciPy's solvers, with their tolerances
 LEAST_TOLERANCE, MOST_TOLERANCE = 1e-10, 1e-7
-"""Of a variable's largest magnitude, or of 1. The first is what the FMU's integrator leaves; beyond the second the
-solvers do not agree, and there is no reference."""
+"""Tolerances relative to a variable's largest magnitude, or to 1. The first one is for the error of the FMU's
+integrator. If the solvers differ by more than the second one, there is no reference.
+"""
 IDEAL: dict[str, float | bool] = {
     **dict.fromkeys(("friction", "control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), 0.0),
     **{"v_from_q": False, "limit_effort": False, **TIGHT},
@@ -98,7 +100,7 @@ def _set(plant: Plant, variable: Variable, value: float | bool) -> None:
 
 
 def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns:
-    """Return the inputs at each communication point, STEPS + 1 values each, as they are written."""
+    """Return the inputs at each communication point, STEPS + 1 values each, rounded as in the file."""
     n, q, blocks = len(plant.q), np.array(plant.q), STEPS // HOLD
     swing, x = SWING * (-1.0) ** np.arange(n), np.array(plant.x)
     plant.q = [*(q + swing)]
@@ -129,7 +131,7 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns
 
 
 def _solve(plant: Plant, names: Mapping[str, Variable], stimuli: Columns, method: str, tolerance: float) -> Columns:
-    """Return the outputs at each communication point by one solver, inputs held over each step."""
+    """Return the outputs at each communication point by one solver, with inputs held over each step."""
     n, rank = len(plant.q), -1
     plant.q, plant.v = list(plant.q_start), list(plant.v_start)
     outputs = [v for v in names.values() if v.causality == "output" and v.group in GROUPS]
@@ -155,10 +157,10 @@ def _solve(plant: Plant, names: Mapping[str, Variable], stimuli: Columns, method
 
 
 def _tolerance(plant: Plant, stimuli: Columns, found: Sequence[Columns]) -> tuple[float, list[str]]:
-    """Put the closed form into the references; return the tolerance and the names that have one.
+    """Put the closed form into the references; return the tolerance, and the names with a closed form.
 
     Raises:
-        BuildError: solvers, or the closed form, do not agree.
+        BuildError: the solvers disagree, or disagree with the closed form.
     """
     first, second = found
     exact = _closed_form(plant, stimuli, first)
@@ -202,7 +204,7 @@ def _closed_form(plant: Plant, stimuli: Columns, solved: Columns) -> Columns:
 
 
 def _csv(times: Array, columns: Columns) -> bytes:
-    """Return a CSV; twelve digits are the same on all machines."""
+    """Return a CSV with twelve digits, which are equal on all machines."""
     rows = [[f"{value:.12g}" for value in row] for row in np.column_stack([times, *columns.values()])]
     return "".join(f"{','.join(row)}\n" for row in [["time", *columns], *rows]).encode()
 

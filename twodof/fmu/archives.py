@@ -1,4 +1,4 @@
-"""Read the zip archives of FMUs, files of their own or members of a system's."""
+"""Read zip archives of FMUs, which are files or members of a system's archive."""
 
 import io
 import zipfile
@@ -14,7 +14,7 @@ from .validation import is_plain_xml
 
 @contextmanager
 def open_archive(path: Path, inside: str, *, checked: bool = False) -> Iterator[zipfile.ZipFile]:
-    """Open an archive, or the one that is a member of it, checked that it is safe to unzip."""
+    """Open an archive, or an archive that is a member of it, after checking that it is safe to unzip."""
     if checked:
         check_archive(path)
     with zipfile.ZipFile(path) as archive:
@@ -32,7 +32,7 @@ def read_archive(path: Path, inside: str) -> tuple[bytes, dict[str, int]]:
     """Return modelDescription.xml and the members' checksums of an FMU that is safe to unzip.
 
     Raises:
-        FmuError: it is missing, damaged, unsafe or no FMU.
+        FmuError: the file is missing, damaged, unsafe or no FMU.
     """
     where = Path(path, inside)
     try:

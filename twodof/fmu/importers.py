@@ -21,21 +21,21 @@ NANOSECONDS = 1_000_000_000
 
 
 def in_this_master(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
-    """Run by this package's own calls."""
+    """Run the stimuli by this package's own calls."""
     with instantiate_fmu(fmu) as instance:
         instance.initialise(reference.start, inf, _starts(fmu, reference))
         return reference.rows(instance.set, instance.step, instance.reader(names))
 
 
 def _starts(fmu: Fmu, reference: Reference) -> Values:
-    """Return the start values of a reference, each of its variable's type."""
+    """Return the start values of a reference, each with its variable's type."""
     kinds: dict[str, Callable[[Any], Any]] = {"Real": float, "Integer": int, "Boolean": bool}
     values = {**reference.parameters, **reference.inputs(0)}
     return {name: kinds[fmu.variables[name].type](value) for name, value in values.items()}
 
 
 def in_fmpy(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
-    """Run by FMPy's simulate_fmu."""
+    """Run the stimuli by FMPy's simulate_fmu."""
     from fmpy import simulate_fmu
 
     columns, numbers = reference.stimuli
@@ -54,7 +54,7 @@ def in_fmpy(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
 
 def in_libcosim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
-    """Run by an execution of libcosim with one slave."""
+    """Run the stimuli by an execution of libcosim with one slave."""
     from libcosimpy.CosimExecution import CosimExecution
     from libcosimpy.CosimManipulator import CosimManipulator
     from libcosimpy.CosimObserver import CosimObserver
@@ -82,7 +82,7 @@ def in_libcosim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
 
 def in_ecos(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
-    """Run by a simulation of ecos with one model."""
+    """Run the stimuli by a simulation of ecos with one model."""
     from ecospy import EcosSimulation, EcosSimulationStructure
 
     with EcosSimulationStructure() as structure:
@@ -102,7 +102,7 @@ def in_ecos(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
 
 def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
-    """Run by the calls of fmuloader."""
+    """Run the stimuli by calls of fmuloader."""
     from fmuloader.fmi2 import Fmi2Slave, Fmi2Type
 
     slave = Fmi2Slave(str(fmu.path), model_identifier=fmu.description.coSimulation.modelIdentifier)
@@ -129,14 +129,14 @@ TOOLS: dict[str, tuple[str, Run, str]] = {
     "ecos": ("ecospy", in_ecos, "23"),
     "fmuloader": ("fmuloader", in_fmuloader, "2"),
 }
-"""Python packages of the tools, their runs, and the versions of FMI that they are tried with."""
+"""Python packages of the tools, functions that run them, and the versions of FMI with which they are tried."""
 
 
 def require(tools: Sequence[str]) -> None:
     """Refuse a tool that is unknown or not installed.
 
     Raises:
-        InputError: naming it, with the remedy.
+        InputError: the message names the tool and the remedy.
     """
     for tool in tools:
         if tool not in TOOLS:

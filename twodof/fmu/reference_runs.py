@@ -1,7 +1,7 @@
-"""Experiments with reference results that an FMU carries, and their runs in this and other FMI tools.
+"""Experiments with reference results in an FMU, and their runs in this and other FMI tools.
 
-Form: FMI-LS-REF and MA-HS-Experiments, its times in the element TransientSimulation or, as drafts have them, in
-Experiment; SSP 1.0's parameter sets; CSV. A deviation is of a variable's largest magnitude in the results, or of 1.
+The format is FMI-LS-REF with MA-HS-Experiments (times in the element TransientSimulation or, in drafts, Experiment),
+parameter sets of SSP 1.0, and CSV. Deviations are relative to a variable's largest magnitude in the results, or to 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .description import Fmu, opened
 from .validation import is_plain_xml
 
 MANIFEST = "extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"
-TIME_TOLERANCE = 1e-6  # of a communication step
+TIME_TOLERANCE = 1e-6  # fraction of a communication step
 MOST_STEPS = 1_000_000
 Values = dict[str, float | bool | int]
 Table = tuple[list[str], NDArray[np.float64]]
@@ -34,11 +34,11 @@ class Reference(NamedTuple):
     """An experiment with its reference results.
 
     Attributes:
-        name: of the experiment.
-        start, stop, step: s.
-        tolerance: of the results; NaN where it states none.
+        name: name of the experiment.
+        start, stop, step: times, s.
+        tolerance: tolerance of the results; NaN if it states none.
         parameters: start values by name.
-        stimuli, results: names of the columns beside the time, and the numbers, the time in the first column.
+        stimuli, results: names of the columns without the time, and the numbers, with the time in the first column.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Reference(NamedTuple):
         return self.start + k * self.step
 
     def inputs(self, k: int) -> Values:
-        """Return the inputs that hold from k steps on."""
+        """Return the inputs that apply after k steps."""
         names, numbers = self.stimuli
         return {n: float(np.interp(self.time(k), numbers[:, 0], numbers[:, i + 1])) for i, n in enumerate(names)}
 
@@ -70,7 +70,7 @@ class Reference(NamedTuple):
         step: Callable[[float, float], object],
         read: Callable[[], Iterable[float]],
     ) -> NDArray[np.float64]:
-        """Step a tool that is initialised; return what it reads after each step, and NaN for the start."""
+        """Step an initialised tool; return the outputs after each step, and NaN for the start."""
         held, rows = self.inputs(0), []
         for k in range(self.steps):
             inputs = self.inputs(k)
@@ -84,7 +84,7 @@ class Reference(NamedTuple):
         """Compare the columns of the results, one row for each communication point; return a line.
 
         Raises:
-            SimulationError: they differ by more than the tolerance.
+            SimulationError: the columns differ by more than the tolerance.
         """
         names, numbers = self.results
         index = np.rint((numbers[:, 0] - self.start) / self.step).astype(int)
@@ -101,10 +101,10 @@ class Reference(NamedTuple):
 
 
 def references_of(fmu: Fmu) -> list[Reference]:
-    """Return the experiments that have results, of an FMU with a manifest of FMI-LS-REF; none without one.
+    """Return an FMU's experiments with results, by its manifest of FMI-LS-REF; none without a manifest.
 
     Raises:
-        FmuError: a file is damaged or missing, or has not the form.
+        FmuError: a file is damaged or missing, or has another format.
     """
     if MANIFEST not in fmu.members:
         return []
@@ -120,7 +120,7 @@ def references_of(fmu: Fmu) -> list[Reference]:
 
 
 class _Files(NamedTuple):
-    """Files of the folder of FMI-LS-REF."""
+    """Files in the folder of FMI-LS-REF."""
 
     archive: zipfile.ZipFile
     folder: str
@@ -137,7 +137,7 @@ class _Files(NamedTuple):
         return ET.fromstring(content)
 
     def reference(self, experiment: ET.Element) -> Reference | None:
-        """Return an experiment; None where it has no results as CSV, or is no simulation over time."""
+        """Return an experiment; None if it has no results as CSV, or is no simulation over time."""
         times = {**experiment.attrib, **getattr(experiment.find("TransientSimulation"), "attrib", {})}
         results, stimuli, parameters = (experiment.find(tag) for tag in ("References", "Stimuli", "Parameters"))
         if results is None or results.get("type", "text/csv") != "text/csv" or "stepSize" not in times:

@@ -1,4 +1,4 @@
-"""Read an SSP 1.0 file: the tree of its system, and the values that parameter bindings give.
+"""Read an SSP 1.0 file: the tree of its systems, and the values of parameter bindings.
 
 Source: System Structure and Parameterization 1.0, Modelica Association, 2019.
 """
@@ -30,13 +30,13 @@ SSC, SSD, SSM, SSV = (
     f"{{http://ssp-standard.org/SSP1/SystemStructure{name}}}"
     for name in ("Common", "Description", "ParameterMapping", "ParameterValues")
 )
-"""Namespaces, as ElementTree writes them."""
+"""Namespaces in the notation of ElementTree."""
 FMU_TYPES = ("application/x-fmu-sharedlibrary", "")
 EXPONENTS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 class Unit(NamedTuple):
-    """A unit: its name, and where it is defined exponents of base units, factor and offset."""
+    """A unit: its name and, if it is defined, exponents of base units, factor and offset."""
 
     name: str = ""
     exponents: tuple[int, ...] | None = None
@@ -51,15 +51,15 @@ class Affine(NamedTuple):
     offset: float = 0.0
 
     def of(self, value: float) -> float:
-        """Return the value mapped; exactly the value where the map changes nothing."""
+        """Return the mapped value; the identity returns exactly the value."""
         return value if self == IDENTITY else self.gain * value + self.offset
 
     def after(self, first: Affine) -> Affine:
-        """Return the map that applies ``first`` and then this one."""
+        """Return the map that applies ``first``, then this map."""
         return Affine(self.gain * first.gain, self.gain * first.offset + self.offset)
 
     def inverse(self, value: float) -> float:
-        """Return what is mapped onto a value; the value where the gain is 0."""
+        """Return the argument that is mapped to a value; the value itself if the gain is 0."""
         return value if self == IDENTITY or self.gain == 0.0 else (value - self.offset) / self.gain
 
 
@@ -67,7 +67,7 @@ IDENTITY = Affine()
 
 
 class Parameter(NamedTuple):
-    """A value of a parameter set, whether its unit is converted, and the map to apply after that."""
+    """A value of a parameter set, whether its unit is converted, and the map that is applied afterwards."""
 
     name: str
     value: float | bool
@@ -77,7 +77,7 @@ class Parameter(NamedTuple):
 
 
 class Connector(NamedTuple):
-    """A connector of a system or component: its kind as SSP has it, and its unit if it states one."""
+    """A connector of a system or component: its kind in SSP, and its unit, if stated."""
 
     kind: str
     unit: Unit
@@ -85,11 +85,11 @@ class Connector(NamedTuple):
 
 @dataclass
 class Element:
-    """A system or component: full name from the top system on ("" is its own), connectors and parameter values.
+    """A system or component: full name relative to the top system (which has ""), connectors and parameter values.
 
     Attributes:
-        source: member of the archive that is a component's FMU; "" of a system.
-        children, connections: of a system; connections as the XML elements.
+        source: member of the archive with the component's FMU; "" for a system.
+        children, connections: elements inside a system, and its connections as XML elements.
     """
 
     name: str
@@ -100,7 +100,7 @@ class Element:
     connections: list[ET.Element] = field(default_factory=list)
 
     def walk(self) -> Iterator[Element]:
-        """Yield all elements, a system after those inside it."""
+        """Yield all elements, each system after the elements inside it."""
         for child in self.children:
             yield from child.walk()
         yield self
@@ -110,7 +110,7 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
     """Return name, top system, default experiment and the text of the structure of an SSP file.
 
     Raises:
-        FmuError: it is damaged, unsafe, not valid, or has a feature that is not supported; naming that.
+        FmuError: the file is damaged, unsafe or invalid, or has an unsupported feature, which the message names.
     """
     try:
         check_archive(path)
@@ -119,7 +119,7 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
             root = file.xml(STRUCTURE, "Description")
             units = _units(root.find(f"{SSD}Units"))
             top = root.find(f"{SSD}System")
-            assert top is not None  # which the schema has
+            assert top is not None  # the schema requires it
             if sum(1 for _ in top.iter(f"{SSD}Component")) > MAX_COMPONENTS:
                 raise FmuError(f"'{path}' has more than {MAX_COMPONENTS} components; OMSimulator takes larger systems")
             default = root.find(f"{SSD}DefaultExperiment")
@@ -139,7 +139,7 @@ class _File:
         self._path, self._archive, self._names = path, archive, {*archive.namelist()}
 
     def xml(self, name: str, kind: str) -> ET.Element:
-        """Return the root of an XML member that its schema allows."""
+        """Return the root of an XML member, validated by its schema."""
         if name not in self._names:
             raise FmuError(f"'{self._path}' has no '{name}'")
         content = read_member(self._archive, name, MAX_DESCRIPTION)
@@ -156,7 +156,7 @@ class _File:
             raise FmuError(f"'{self._path}': {name} is not valid SSP 1.0: {error!s:.300}") from error
 
     def element(self, xml: ET.Element, name: str, units: dict[str, Unit]) -> Element:
-        """Return a system, with those inside it, or a component."""
+        """Return a system with the elements inside it, or a component."""
         connectors = {}
         for connector in xml.iterfind(f"{SSD}Connectors/{SSD}Connector"):
             kind = next((child for child in connector if child.tag.startswith(SSC)), None)
@@ -200,7 +200,7 @@ class _File:
             kind = next(child for child in xml if child.tag.startswith(SSV))
             text, unit = kind.get("value", ""), kind.get("unit", "")
             of_kind = NUMBERS.get(kind.tag.removeprefix(SSV))
-            if of_kind is not None:  # no variable here takes a text
+            if of_kind is not None:  # variables here accept no text
                 own = xml.get("name", "")
                 given[prefix + own] = Parameter(prefix + own, of_kind(text.strip()), units.get(unit, Unit(unit)))
         mapping = binding.find(f"{SSD}ParameterMapping")
@@ -217,7 +217,7 @@ class _File:
                 yield parameter._replace(name=target, converts=converts, map=transformation(entry, what))
 
     def _content(self, xml: ET.Element, inside: str, namespace: str, kind: str, name: str) -> ET.Element:
-        """Return the root of a set or mapping, which is inline or a file."""
+        """Return the root of a parameter set or mapping, which is inline or a file."""
         inline = (xml.find(inside) if inside else xml) if not xml.get("source") else None
         root = None if inline is None else next((c for c in inline if c.tag.startswith(namespace)), None)
         if root is not None:
@@ -242,7 +242,7 @@ def transformation(xml: ET.Element, what: str) -> Affine:
     """Return the linear transformation of a connection or mapping entry.
 
     Raises:
-        FmuError: it has another one, or one that is not finite.
+        FmuError: the transformation has another kind, or is not finite.
     """
     for child in xml:
         if child.tag.startswith(SSC) and child.tag.endswith("Transformation"):

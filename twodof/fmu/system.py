@@ -1,4 +1,4 @@
-"""A system of FMUs in an SSP 1.0 file, with the interface of one FMU: that of the robot in it."""
+"""A system of FMUs in an SSP 1.0 file, with the interface of its robot's FMU."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from .wiring import Link, Node, Wiring, order
 class System(Fmu):
     """A system of co-simulation FMUs, one of which is the robot.
 
-    ``variables`` has those of the robot by their own names, those of other components as "component.name", and
-    connectors of the system by theirs. A variable that a connection drives is of causality "local".
+    ``variables`` has the robot's variables and the system's connectors by their own names, and variables of other
+    components as "component.name". A variable that a connection drives has the causality "local".
 
     Attributes:
         title: the system's name.
         digest: SHA-256 of its structure and its FMUs' digests.
         components: FMUs by full name.
         links: connections of components' variables with their first sources.
-        batches: outputs and inputs in the order in which their values are known at one instant.
-        places: component's variable, or connector of a system, that each of ``variables`` is.
-        bound: start values of components' variables by parameter bindings.
+        batches: outputs and inputs in the order of evaluation at one instant.
+        places: the component's variable, or the system's connector, for each of ``variables``.
+        bound: start values of components' variables from parameter bindings.
     """
 
     title: str = ""
@@ -59,7 +59,7 @@ class System(Fmu):
 
     @property
     def connections(self) -> list[str]:
-        """Texts of the connections, elements of vectors together, as "plant.q -> controller.q"."""
+        """Texts of the connections, such as "plant.q -> controller.q", with one text for a vector."""
         groups: dict[tuple[str, str, Affine], int] = {}
         for link in self.links:
             source, target = (str(node).partition("[")[0] for node in link[:2])
@@ -77,11 +77,11 @@ def load_fmu(path: str | Path, robot: str = "") -> Fmu:
 
     Args:
         path: an FMU, or an SSP 1.0 file.
-        robot: component of a system whose q and v are the robot's; "": the only one that has such.
+        robot: component of a system with the robot's outputs q and v; "": the only component with such outputs.
 
     Raises:
-        FmuError: the file is missing, no zip, not FMI 2.0 or 3.0 co-simulation or SSP 1.0, unsafe to unzip, or
-            has no outputs q[i] and v[i].
+        FmuError: the file is missing, is no zip archive, is unsafe to unzip, is no co-simulation FMU of FMI 2.0 or
+            3.0 and no SSP 1.0 file, or has no outputs q[i] and v[i].
     """
     path = Path(path)
     if has_member(path, STRUCTURE):
@@ -95,7 +95,7 @@ def load_system(path: Path, robot: str = "") -> System:
     """Read a system of FMUs.
 
     Raises:
-        FmuError: naming the feature, component or connection that is at fault.
+        FmuError: a feature, component or connection is invalid; the message names it.
     """
     title, top, times, structure = read_ssp(path)
     fmus: dict[str, Fmu] = {}
@@ -135,7 +135,7 @@ def load_system(path: Path, robot: str = "") -> System:
 
 
 def _robot(path: Path, fmus: dict[str, Fmu], robot: str) -> str:
-    """Return the name of the component that is the robot; its joints are named."""
+    """Return the name of the robot's component, and fill in the joint names of its FMU."""
     if robot and robot not in fmus:
         raise FmuError(f"'{path}' has no component '{robot}'{choice(robot, fmus)}")
     having = [name for name, fmu in fmus.items() if fmu.vector("q") and fmu.vector("v")] if not robot else [robot]
@@ -148,12 +148,12 @@ def _robot(path: Path, fmus: dict[str, Fmu], robot: str) -> str:
 
 
 def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
-    """Return start values that parameter bindings give, those of outer systems before those of inner ones."""
+    """Return start values from parameter bindings; outer systems take precedence over inner ones."""
     starts: dict[Node, float | bool] = {}
     for element in wiring.elements.values():
         for parameter in element.parameters:
             node = wiring.find(f"{element.name}.{parameter.name}" if element.name else parameter.name)
-            if node is not None:  # the standard ignores others
+            if node is not None:  # by the standard, other parameters are ignored
                 starts[node] = _value(path, wiring, node, parameter)
     return starts
 
@@ -181,7 +181,7 @@ def _variables(
     starts: Mapping[Node, float | bool],
     robot: str,
 ) -> tuple[dict[str, Scalar], dict[str, Node]]:
-    """Return the variables of a system, those of its robot by their own names, and what each of them is."""
+    """Return the variables of a system, and the component's variable or the connector for each of them."""
     variables: dict[str, Scalar] = {}
     places: dict[str, Node] = {}
 

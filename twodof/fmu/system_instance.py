@@ -4,7 +4,7 @@
         outputs y(t_k) of each FMU; inputs u(t_k) = gain · y(t_k) + offset of the FMUs that they are connected to
     then each FMU steps from t_k to t_(k+1) with its inputs held
 
-So a signal that passes through an FMU without delay has none, and the order of FMUs has no effect.
+Therefore direct feedthrough of an FMU adds no delay, and the order of the FMUs has no effect.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from .system import System
 from .wiring import Link, Node
 
 READ = ("documentation/", "sources/")
-"""Folders of an FMU that no library looks into."""
+"""Folders of an FMU that its library does not need."""
 
 
 class SystemInstance:
-    """Instances of the FMUs of a system, that step together; its methods are those of ``Instance``."""
+    """Instances of a system's FMUs, which step together; the methods are those of ``Instance``."""
 
     def __init__(self, system: System, instances: Mapping[str, Instance]) -> None:
         self._system, self._instances = system, instances
@@ -43,7 +43,7 @@ class SystemInstance:
         self._due = True
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
-        """Set start values and pass initialisation mode, all FMUs together."""
+        """Set start values, and enter and exit initialisation mode, for all FMUs together."""
         every = {name: self._system.start_values[name] for name in self._outer_names()}
         own = self._by_component({**every, **values})
         for name, instance in self._instances.items():
@@ -74,7 +74,7 @@ class SystemInstance:
         self._due = True
 
     def _by_component(self, values: Mapping[str, float | bool]) -> dict[str, dict[str, float | bool]]:
-        """Return values by component and the variable's name there, those of connectors through their connections."""
+        """Return values by component and its variable's name; a connector's value goes to the connected variables."""
         own: dict[str, dict[str, float | bool]] = {}
         for name, value in values.items():
             node = self._system.places[name]
@@ -113,7 +113,7 @@ class SystemInstance:
         self._due = False
 
     def _moves_of(self, batch: Sequence[Node]) -> Iterator[tuple[str, Callable[[], object]]]:
-        """Yield components and functions that read outputs of a batch, or set inputs from outputs of earlier ones."""
+        """Yield components and functions that read a batch's outputs, or set inputs from earlier outputs."""
         incoming = {link.target: link for link in self._system.links}
         for element, instance in self._instances.items():
             own = [node for node in batch if node.element == element]
@@ -163,9 +163,10 @@ class SystemInstance:
 def instantiate_fmu(fmu: Fmu) -> Iterator[Instance]:
     """Instantiate an FMU from a temporary folder, and free the instance at the end.
 
-    It is unzipped into a temporary folder, but for what is there to be read by people.
+    Its documentation is not unzipped.
 
-    An FmuError says that it has no binary for this platform, or cannot be unzipped or loaded.
+    Raises:
+        FmuError: it has no binary for this platform, or cannot be unzipped or loaded.
     """
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
@@ -188,10 +189,10 @@ def instantiate_fmu(fmu: Fmu) -> Iterator[Instance]:
 
 @contextmanager
 def instantiate(fmu: Fmu) -> Iterator[Instance | SystemInstance]:
-    """Instantiate an FMU, or those of a system, from temporary folders, and free the instances at the end.
+    """Instantiate an FMU, or the FMUs of a system, from temporary folders, and free the instances at the end.
 
     Raises:
-        FmuError: one has no binary for this platform, or cannot be unzipped or loaded.
+        FmuError: an FMU has no binary for this platform, or cannot be unzipped or loaded.
     """
     if not isinstance(fmu, System):
         with instantiate_fmu(fmu) as instance:

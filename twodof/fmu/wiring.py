@@ -1,4 +1,4 @@
-"""Connections of a system: from the outputs of FMUs to inputs, through nested systems, in the order of feedthrough."""
+"""Connections of a system from outputs of FMUs through nested systems to inputs, in the order of feedthrough."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SOURCES = ("output", "calculatedParameter")
 
 
 class Node(NamedTuple):
-    """A connector: the full name of its system or component, "" for the top system, and its own name."""
+    """A connector: full name of its system or component ("" for the top system), and its own name."""
 
     element: str
     connector: str
@@ -34,12 +34,12 @@ class Link(NamedTuple):
 
 
 class Wiring:
-    """Elements of a system by full name, their variables and units, and what connects them.
+    """Elements of a system by full name, their variables and units, and their connections.
 
     Args:
-        path: for messages.
+        path: path for messages.
         top: the top system.
-        fmus: of the components, by full name.
+        fmus: FMUs of the components, by full name.
     """
 
     def __init__(self, path: object, top: Element, fmus: Mapping[str, Fmu]) -> None:
@@ -52,7 +52,7 @@ class Wiring:
                 self._connect(element, connection)
 
     def scalar(self, node: Node) -> Scalar | None:
-        """Return a component's variable; None of a system's connector.
+        """Return a component's variable; None for a connector of a system.
 
         Raises:
             FmuError: the component has no such variable.
@@ -64,8 +64,8 @@ class Wiring:
         return fmu.variables[node.connector]
 
     def find(self, name: str) -> Node | None:
-        """Return the variable or connector of a full name; None where there is none."""
-        for element in [*self.elements][::-1]:  # the innermost comes last
+        """Return the variable or connector with a full name, or None."""
+        for element in [*self.elements][::-1]:  # the innermost element is the last
             own = name.removeprefix(f"{element}.") if element else name
             named = self._fmus[element].variables if element in self._fmus else self.elements[element].connectors
             if own in named and (own != name or not element):
@@ -91,7 +91,7 @@ class Wiring:
         return connectors[node.connector].kind
 
     def _connect(self, system: Element, connection: Mapping[str, str] | object) -> None:
-        """Take over a connection inside a system, whose start may be its sink."""
+        """Add a connection inside a system; its start may be the sink."""
         get = connection.get  # type: ignore[union-attr]
         ends = []
         for end in ("start", "end"):
@@ -117,7 +117,7 @@ class Wiring:
         """Return the connections of components' variables with their first sources.
 
         Raises:
-            FmuError: a connection comes back to itself, or connects different types or units.
+            FmuError: connections form a loop without a component, or connect different types or units.
         """
         found = []
         for target in self._incoming:
@@ -135,7 +135,7 @@ class Wiring:
         return found
 
     def _map(self, way: list[Node]) -> Affine:
-        """Return the map of values along a way, with conversions of units."""
+        """Return the map of values along a path of connections, with conversions of units."""
         total, unit = IDENTITY, self.unit(way[0])
         for node in way[1:]:
             start, converts, affine = self._incoming[node]
@@ -155,10 +155,10 @@ class Wiring:
         return total
 
     def conversion(self, source: Unit, target: Unit, what: str) -> Affine:
-        """Return the conversion between units, none where one of them is not stated.
+        """Return the conversion between units; the identity if one of them is not stated.
 
         Raises:
-            FmuError: they differ in dimension, or are not defined.
+            FmuError: the units differ in dimension, or are not defined.
         """
         if not source.name or not target.name or source == target:
             return IDENTITY
@@ -189,13 +189,13 @@ def _units_of(fmu: Fmu) -> dict[str, Unit]:
 
 
 def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[list[Node]]:
-    """Return batches of outputs and inputs in the order in which their values are known at one instant.
+    """Return batches of outputs and inputs in the order of evaluation at one instant.
 
-    An output follows the connected inputs on which it depends directly, by its FMU's ModelStructure; on all of them
-    where that does not say.
+    An output follows the connected inputs on which it depends directly by its FMU's ModelStructure. Without stated
+    dependencies, it follows all of them.
 
     Raises:
-        FmuError: there is an algebraic loop; naming it.
+    FmuError: there is an algebraic loop, which the message names.
     """
     between = [link for link in links if link.source.element in fmus]
     inputs: dict[str, list[Node]] = {}

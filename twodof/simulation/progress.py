@@ -23,7 +23,7 @@ def in_notebook() -> bool:
 
 
 def _bar(what: str, unit: str, **options: Any) -> Any:
-    """Return a bar of tqdm that vanishes at its end; a widget where the notebook has them, else text."""
+    """Return a bar of tqdm that disappears at its end: a widget if the notebook has widgets, else text."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ipywidgets may be missing
         from tqdm.auto import tqdm
@@ -32,7 +32,7 @@ def _bar(what: str, unit: str, **options: Any) -> Any:
 
 @contextmanager
 def counting(what: str, unit: str, *, shown: bool) -> Iterator[Callable[[int, int], None]]:
-    """Return a function that shows the numbers of what is done and of all, if it is to."""
+    """Return a callback that shows the numbers of finished and of all runs in a bar, or does nothing."""
     with ExitStack() as stack:
         bar: Any = None
 
@@ -47,7 +47,7 @@ def counting(what: str, unit: str, *, shown: bool) -> Iterator[Callable[[int, in
 
 
 class Progress(Sink):
-    """Bar of the simulated time."""
+    """Progress bar over the simulated time."""
 
     def begin(self, run: Experiment) -> Progress:
         """Receive the experiment; return self."""
