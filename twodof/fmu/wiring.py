@@ -195,7 +195,7 @@ def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[
     dependencies, it follows all of them.
 
     Raises:
-    FmuError: there is an algebraic loop, which the message names.
+        FmuError: there is an algebraic loop, which the message names.
     """
     between = [link for link in links if link.source.element in fmus]
     inputs: dict[str, list[Node]] = {}
