@@ -16,7 +16,7 @@ Judge a run:                    verdict, Verdict
 Write and read bags:            Bag, read_bag, Recording, export_bag, read_commands, recover
 Draw figures and pages:         plot, view, page, live, show
 Run it over many gains:         sweep, read_sweep
-Check an FMU of any maker:      check, Check
+Check an FMU of any vendor:     check, Check
 Fit a robot to its bags:        fit, Fit
 Linear models:                  linearise, LinearModel
 ROS 2 and Foxglove:             publish, publish_together, Publisher, Foxglove, layouts
