@@ -36,6 +36,9 @@ FAILURES = {
     "out of reach": Failure("arm", "task", {"x_des": (0.5, 0.1)}, ("reach",), "out of reach by 0.2099 m"),
     "a target in millimetres": Failure("arm", "task", {"x_des": (200.0, 50.0)}, ("reach",), "in millimetres?"),
     "degrees": Failure("arm", "joint", {"q_des": (90.0, 0.35)}, ("degrees",), "q_des[1] = 90 rad: 90°?"),
+    "degrees beyond the limits": Failure(
+        "arm", "joint", {"q_des": (90.0, 0.35), "q_max": (1.0, 3.0)}, ("reach",), "is 1 rad; is it in degrees?"
+    ),
     "beyond a joint limit": Failure(
         "arm", "joint", {"q_des": (0.5, 0.8), "q_max": (1.0, 0.6)}, ("reach",), "'joint2' is out of reach by 0.2 rad"
     ),
@@ -56,6 +59,9 @@ FAILURES = {
     "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
     "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] = 0"),
     "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp[1] = 20"),
+    "no damping of the orientation": Failure(
+        "panda", "pose", {"Kd_rot": 0.0, "x_des": (0.3554, -0.0699, 0.5369)}, ("damping",), "Kd_rot[1] = 0 s⁻¹ damps"
+    ),
     "a joint that sticks": Failure(
         "arm",
         "joint",

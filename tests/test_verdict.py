@@ -57,6 +57,12 @@ def test_a_bag_a_figure_and_a_page_say_the_same(
     assert main(["view", str(bag), "--export", str(tmp_path / "view.html")]) == 0
 
 
+def test_a_target_that_changed_late_is_named() -> None:
+    changes = [(1.9, {"x_des": (0.1, 0.1)})]
+    verdict = twodof.simulate(fmu_of("arm", "task"), changes=changes, stop_time=2.0).verdict
+    assert "the target changed at 1.9 s, and the position still approaches" in verdict.lines[0]
+
+
 @pytest.mark.parametrize("robot", list(ROBOTS))
 def test_good_runs_raise_no_alarm(robot: str) -> None:
     count = 0

@@ -76,8 +76,8 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         found += [*_singular(judge), *_slow(judge, missed)]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *_sampled(judge)]
-    if missed and motion in ("oscillating", "diverging"):
-        found += _damping(judge)
+    if missed:
+        found += _damping(judge, ["x", "quat"] if motion in ("oscillating", "diverging") else missed)
     order, motors = [*KINDS], max((cause.share for cause in found if cause.kind == "saturation"), default=0.0)
 
     def rank(cause: Cause) -> tuple[int, bool, float]:
@@ -118,7 +118,8 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         by, limit = (low - wanted, low) if wanted < low else (wanted - high, high)
         if by > AT_LIMIT and joint not in known:
             text = f"the target {wanted:.4g} {unit} of joint '{joint}' is out of reach by {by:.4g} {unit}"
-            yield Cause("reach", f"{text}: its limit is {limit:.4g} {unit}", float(by), joint)
+            degrees = "; is it in degrees?" if unit == "rad" and abs(wanted) > LEAST_TURN else ""
+            yield Cause("reach", f"{text}: its limit is {limit:.4g} {unit}{degrees}", float(by), joint)
     robot, target, quat = setup.robot, judge.wanted("x"), judge.wanted("quat")
     if robot is None or setup.frame not in robot.links or not target.size or not {"x", "quat"} & {*missed}:
         return
@@ -258,8 +259,8 @@ def _sampling(judge: Judge, i: int) -> Iterator[str]:
             yield f"{name} = {starts[name]:g} {of}"
 
 
-def _damping(judge: Judge) -> Iterator[Cause]:
-    for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
+def _damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    for stiff, damp in dict.fromkeys(("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd") for name in missed):
         Kp, Kd = judge.given(stiff), judge.given(damp)
         ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
         if ratios and min(ratios)[0] < 0.2:
@@ -296,5 +297,6 @@ def _slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
         steady = bool((np.diff(size[k:]) < 0.0).all())
         if steady and left < 1000.0 * judge.duration:
-            text = f"the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
+            late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
+            text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
             yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or raise the gains", left)
