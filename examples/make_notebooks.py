@@ -74,7 +74,7 @@ import twodof""",
     """## The URDF
 
 Masses in kg, lengths in m, angles in rad. Each link that moves needs a mass and an inertia; limits of effort and
-velocity make the verdict tell what the motors cannot do.""",
+velocity let the verdict report what the motors cannot do.""",
     '''LINK = """<link name="{name}"><inertial><origin xyz="{x} 0 {z}"/><mass value="{mass}"/>
 <inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 JOINT = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>
@@ -128,8 +128,8 @@ model.gravity.linear = np.array([0.0, -9.81, 0.0])
 data = model.createData()""",
     """## The loop
 
-`samples` yields a sample at each communication point, and takes the inputs that hold from there on. The law is a PD
-of the joints with inverse dynamics, as computed torque is.""",
+`samples` yields a sample at each communication point, and accepts the inputs that apply from there on. The law is a PD
+of the joints with inverse dynamics (computed torque).""",
     """def run(law, bag, steps=2000):
     sink = twodof.Bag(bag, effort=True)
     experiment = twodof.experiment(fmu, step=0.001, stop_time=0.001 * steps)
@@ -165,7 +165,7 @@ import twodof""",
 grid = {"Kp": [20, 40, 80, 160, 320], "Kd": [5, 10, 20, 40]}
 table = twodof.sweep(fmu, grid=grid, stop_time=3, output="gains", bags=True)
 table""",
-    """## The best by a cost of one's own
+    """## The best run by your own cost
 
 Names are the table's columns; pandas sorts them.""",
     """table["cost"] = table.eval("settling_time + 0.1 * peak_effort")
