@@ -33,6 +33,7 @@ ROOMS = {
     "identification": "a robot's parameters, of what bags hold",
     "sweeps": "many runs, and a bag of each",
     "plots": "figures of bags and sweeps",
+    "testing": "assertions for tests of users",
     "pages": "in the browser, what plots know and bags hold",
     "cli": "all of it, by a command",
 }
@@ -54,6 +55,7 @@ LIBRARIES = {
     "pinocchio": {"plant", "identification"},  # its regressors
     "plotly": {"plots"},
     "pyarrow": {"sweeps"},
+    "pytest": {"testing"},
     "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
     "rosbags": {"ros", "bag"},
     "scipy": {"export", "geometry", "identification"},  # its rotations; filters and least squares

@@ -1,0 +1,119 @@
+"""The pytest plugin and its assertions, in runs of pytest of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import twodof
+from twodof.testing import assert_equal, assert_settles, assert_within_limits
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> dict[str, Path]:
+    """Bags of the default arm: one that settles, a slow one, and one with an external effort."""
+    folder = tmp_path_factory.mktemp("runs")
+    settings = {"good": {}, "slow": {"Kp": 5.0}, "pushed": {"tau_ext[1]": 1e-3}}
+    for name, values in settings.items():
+        twodof.run(native_path, twodof.Bag(folder / name, effort=True), stop_time=4.0, settings=values)
+    return {name: folder / name for name in settings}
+
+
+def test_a_run_that_is_as_asserted_passes(runs: dict[str, Path]) -> None:
+    assert_settles(runs["good"], within=3.1)
+    assert_within_limits(twodof.read_bag(runs["good"]))
+    assert_equal(runs["good"], twodof.read_bag(runs["good"]), within=0.0)
+
+
+def test_settling_is_that_of_the_error(runs: dict[str, Path]) -> None:
+    """The time in the message is the last sample at which the distance exceeds 2 % of the first."""
+    bag = twodof.read_bag(runs["good"])
+    distance = ((bag.x - (0.2, 0.05)) ** 2).sum(axis=1) ** 0.5
+    outside = bag.t[distance > 0.02 * distance[0]][-1]
+    with pytest.raises(AssertionError) as caught:
+        assert_settles(bag, within=outside)
+    (time,) = re.findall(r"settles after ([\d.]+) s, and is to settle within", str(caught.value))
+    assert 0.0 < float(time) - outside <= 0.0101
+    with pytest.raises(AssertionError, match="the run does not settle"):
+        assert_settles(runs["slow"], within=3.0)
+
+
+def test_a_limit_that_is_exceeded_is_named(tmp_path: Path, native_path: Path) -> None:
+    twodof.run(native_path, twodof.Bag(tmp_path / "fast"), stop_time=0.3, settings={"v_start": (0.0, 30.0)})
+    bag = twodof.read_bag(tmp_path / "fast")
+    limit = bag.setup.limits.velocity[1]
+    assert abs(bag.v[0, 1]) > limit
+    with pytest.raises(AssertionError, match=f"v of joint 'joint2' is 30 at 0 s, its limit is {limit:g}"):
+        assert_within_limits(bag)
+
+
+def test_a_deviation_is_named_with_its_time(runs: dict[str, Path]) -> None:
+    good, pushed = (twodof.read_bag(runs[name]) for name in ("good", "pushed"))
+    k = int((abs(good.q - pushed.q) > 1e-5).any(axis=1).argmax())
+    i = int((abs(good.q - pushed.q)[k] > 1e-5).argmax())
+    text = f"q of joint '{good.joints[i]}' is {pushed.q[k, i]:.9g} instead of {good.q[k, i]:.9g} at {good.t[k]:.6g} s"
+    with pytest.raises(AssertionError, match=re.escape(text)):
+        assert_equal(pushed, good, within=1e-5)
+
+
+def test_what_cannot_be_compared_fails(runs: dict[str, Path]) -> None:
+    """A run without limits, a target or equal samples is not as asserted."""
+    good = twodof.read_bag(runs["good"])
+    unknown = dataclasses.replace(good, provenance={})
+    shorter = dataclasses.replace(good, stamps=good.stamps[:-1], q=good.q[:-1], v=good.v[:-1])
+    with pytest.raises(AssertionError, match="no limit is known"):
+        assert_within_limits(unknown)
+    with pytest.raises(AssertionError, match="the run cannot settle"):
+        assert_settles(unknown, within=9.0)
+    with pytest.raises(AssertionError, match=r"400 samples in 3\.99 s, and its reference 401 samples in 4 s"):
+        assert_equal(shorter, good, within=1.0)
+    with pytest.raises(AssertionError, match="the joints are a, b, and of the reference joint1, joint2"):
+        assert_equal(dataclasses.replace(good, joints=("a", "b")), good, within=1.0)
+
+
+TEST = """
+from twodof.testing import assert_equal, assert_settles
+
+def test_good(run_fmu, check_fmu):
+    bag = run_fmu({fmu!r}, stop_time=4.0)
+    assert_settles(bag, within=3.1)
+    assert_equal(bag, run_fmu({fmu!r}, stop_time=4.0), within=0.0)
+    assert check_fmu({fmu!r}).passed
+
+def test_late(run_fmu):
+    assert_settles(run_fmu({fmu!r}, stop_time=4.0), within=1.0)
+"""
+
+
+def pytest_of_a_user(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pytest", "-p", "twodof.testing.plugin", "-p", "no:cacheprovider", *arguments]
+    command += ["--basetemp", str(folder / "temporary")]
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path: Path, native_path: Path) -> None:
+    (tmp_path / "test_arm.py").write_text(TEST.format(fmu=str(native_path)))
+    done = pytest_of_a_user(tmp_path, "--twodof-report", "report")
+    assert "1 failed, 1 passed" in done.stdout, done.stdout + done.stderr
+    assert "and is to settle within 1 s" in done.stdout
+    (plot,) = (tmp_path / "report").iterdir()
+    assert plot.name == "test_arm.py_test_late.html" and str(plot) in done.stdout
+    assert plot.read_text().count("<polyline") == 2
+
+
+def test_the_plugin_imports_nothing_heavy(tmp_path: Path) -> None:
+    (tmp_path / "test_light.py").write_text(
+        "import sys\n\ndef test_light():\n    assert not {'numpy', 'fmpy', 'pinocchio', 'rosbags'} & {*sys.modules}\n"
+    )
+    assert pytest_of_a_user(tmp_path).returncode == 0
+    entry = 'pytest11]\n"twodof.testing.plugin" = "twodof.testing.plugin"'
+    assert entry in (ROOT / "pyproject.toml").read_text()

@@ -1,0 +1,133 @@
+"""Assertions about a run: a failure names time, joint, value and bound, and leaves a plot.
+
+A run is a bag: its folder, or its ``Recording``. The plot is an HTML file in the folder of pytest's option
+``--twodof-report``; without the plugin, or the option's folder, there is none.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..bag.recording import Recording
+
+    Array = NDArray[np.float64]
+
+REPORT: list[Path] = []
+"""The report's folder, which the plugin appends."""
+EXACT = 1e-9  # of a limit: a joint that its stop holds is within it
+
+
+def assert_settles(run: Recording | str | Path, *, within: float) -> None:
+    """Assert that a run settles: its error stays within 2 % of the first one, from some time on to the end.
+
+    Args:
+        run: the run; it has a target that it can reach.
+        within: longest settling time since the last change of the target, s.
+
+    Raises:
+        AssertionError: it does not settle, settles later, or has no target.
+        BagError: the bag cannot be read.
+    """
+    bag = _recording(run)
+    verdict = bag.verdict
+    settling = verdict.numbers.get("settling_time")
+    if settling is None:
+        _fail(bag, f"the run cannot settle: {verdict}", [])
+    if not settling <= within:
+        took = f"settles after {settling:.4g} s" if settling < float("inf") else "does not settle"
+        curves = bag.x - bag.target if bag.target.size and bag.x.size else bag.held("q_des", bag.q.shape[1]) - bag.q
+        _fail(bag, f"the run {took}, and is to settle within {within:g} s; {verdict}", [*curves.T], "error")
+
+
+def assert_within_limits(run: Recording | str | Path) -> None:
+    """Assert that all joints stay within their limits of position, velocity and effort.
+
+    Position limits are the run's or the URDF's, the others the URDF's. Efforts are checked if the bag has them.
+
+    Raises:
+        AssertionError: a joint exceeds a limit, or no limit is known.
+        BagError: the bag cannot be read.
+    """
+    import numpy as np
+
+    bag = _recording(run)
+    setup = bag.setup
+    effort, velocity = np.array(setup.limits.effort), np.array(setup.limits.velocity)
+    checked = {
+        "q": (bag.q, setup.low, setup.high),
+        "v": (bag.v, -velocity, velocity),
+        "tau": (bag.tau, -effort, effort),
+    }
+    known = [np.isfinite(bound).any() for _, *bounds in checked.values() for bound in bounds]
+    if not any(known):
+        _fail(bag, "no limit is known: the bag names no robot with limits", [])
+    for name, (values, low, high) in checked.items():
+        if values.shape != bag.q.shape:
+            continue
+        beyond = np.maximum(low - values, values - high) > EXACT * np.maximum(1.0, np.abs(values))
+        if beyond.any():
+            k, i = np.argwhere(beyond)[0]
+            bound = high[i] if values[k, i] > high[i] else low[i]
+            ends = [np.full(len(bag.t), end[i]) for end in (low, high) if np.isfinite(end[i])]
+            text = (
+                f"{name} of joint '{bag.joints[i]}' is {values[k, i]:.6g} at {bag.t[k]:.6g} s, its limit is {bound:.6g}"
+            )
+            _fail(bag, text, [values[:, i], *ends], f"{name} of {bag.joints[i]}")
+
+
+def assert_equal(run: Recording | str | Path, reference: Recording | str | Path, *, within: float) -> None:
+    """Assert that a run has the positions and velocities of a reference, sample by sample.
+
+    Args:
+        run, reference: the runs, of equal joints and times.
+        within: largest deviation of a value, in rad, m, rad/s or m/s.
+
+    Raises:
+        AssertionError: joints, times or values differ.
+        BagError: a bag cannot be read.
+    """
+    import numpy as np
+
+    bag, other = _recording(run), _recording(reference)
+    if bag.joints != other.joints:
+        _fail(bag, f"the joints are {', '.join(bag.joints)}, and of the reference {', '.join(other.joints)}", [])
+    if len(bag.t) != len(other.t) or not np.array_equal(bag.t, other.t):
+        spans = (f"{len(each.t)} samples in {each.t[-1]:.6g} s" for each in (bag, other))
+        _fail(bag, "the run has {}, and its reference {}".format(*spans), [])
+    for name in ("q", "v"):
+        values, expected = getattr(bag, name), getattr(other, name)
+        off = np.abs(values - expected)
+        if not (off <= within).all():
+            k, i = np.argwhere(~(off <= within))[0]
+            text = f"{name} of joint '{bag.joints[i]}' is {values[k, i]:.9g} instead of {expected[k, i]:.9g}"
+            text += f" at {bag.t[k]:.6g} s; the bound is {within:g}, the largest deviation {off.max():.3g}"
+            _fail(bag, text, [values[:, i], expected[:, i]], f"{name} of {bag.joints[i]}")
+
+
+def _recording(run: Recording | str | Path) -> Recording:
+    from ..bag.reader import read_bag
+
+    return read_bag(run) if isinstance(run, str | Path) else run
+
+
+def _fail(bag: Recording, text: str, curves: Sequence[Any], label: str = "") -> NoReturn:
+    """Raise the assertion's error, with the plot's path."""
+    if REPORT and curves:
+        from ..notebook import card, picture
+
+        test = os.environ.get("PYTEST_CURRENT_TEST", "run").rpartition(" ")[0] or "run"
+        name = re.sub(r"[^\w.-]+", "_", test.rpartition("/")[2])
+        path = REPORT[-1] / f"{name[:100]}.html"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        plot = picture(((bag.t, curve) for curve in curves), "t in s", label)
+        path.write_text(f'<!DOCTYPE html><meta charset="utf-8">{card(test, {"bag": bag.path, "failure": text}, plot)}')
+        text += f"\nplot: {path}"
+    raise AssertionError(f"'{bag.path}': {text}")

@@ -1,0 +1,56 @@
+"""pytest plugin: fixtures that run and check FMUs, and the folder of the assertions' plots.
+
+pytest loads it in each of its runs; the package is imported when a fixture is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from .assertions import REPORT
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Register the option."""
+    text = "folder of plots of failed assertions about runs (none)"
+    parser.getgroup("twodof").addoption("--twodof-report", metavar="FOLDER", help=text)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set the folder of plots."""
+    if folder := config.getoption("twodof_report"):
+        REPORT.append(Path(folder).absolute())
+
+
+@pytest.fixture
+def run_fmu(tmp_path: Path) -> Callable[..., Any]:
+    """Return a function that runs an FMU into a bag and returns its ``Recording``; keywords as of ``twodof.run``."""
+
+    def run(fmu: str | Path, **options: Any) -> Any:
+        import twodof
+
+        bag = tmp_path / f"run{len(list(tmp_path.glob('run*')))}"
+        twodof.run(fmu, twodof.Bag(bag, effort=True), **options)
+        return twodof.read_bag(bag)
+
+    return run
+
+
+@pytest.fixture
+def check_fmu() -> Callable[..., Any]:
+    """Return a function that checks an FMU, as ``twodof.check``, and fails with the rows that failed."""
+
+    def check(fmu: str | Path, **options: Any) -> Any:
+        import twodof
+
+        found = twodof.check(fmu, **options)
+        failed = [f"{row.name}: {row.text}" for row in found.rows if row.outcome == "failed"]
+        if failed:
+            pytest.fail(f"'{fmu}' fails\n" + "\n".join(failed), pytrace=False)
+        return found
+
+    return check
