@@ -1,7 +1,7 @@
 """Assertions about a run: a failure names time, joint, value and bound, and leaves a plot.
 
-A run is a bag: its folder, or its ``Recording``. The plot is an HTML file in the folder of pytest's option
-``--twodof-report``; without the plugin, or the option's folder, there is none.
+A run is a bag: its folder, or its ``Recording``. The plot is an HTML file in the report's folder, an option
+of the plugin; without the folder there is none.
 """
 
 from __future__ import annotations
