@@ -154,8 +154,8 @@ RIDDLES = {"What", "Of", "Who", "Whose", "How", "That", "Which", "Beside", "Whet
 VERBS = re.findall(
     r"\w+",
     """
-    Add Advance Append Apply Assert Bound Build Change Check Close Compare Compile Complete Compose Confine Convert Count
-    Create Decode Deserialise Determine Discard Do Draw End Execute Exit Expand Find Fit Flush Format Free Import
+    Add Advance Append Apply Bound Build Change Check Close Compare Compile Complete Compose Confine Convert Count
+    Assert Create Decode Deserialise Determine Discard Do Draw End Execute Exit Expand Find Fit Flush Format Free Import
     Install Instantiate Integrate Join Judge Keep Let Limit Load Lock Make Mark Match Measure Merge Move Name Note
     Open Pack Parse Pass Prevent Print Publish Put Queue Quote Raise Read Receive Refuse Register Reject Remove
     Replace Replay Report Reset Resolve Restart Restore Restrict Return Rotate Round Run Sample Save Say Send Set
@@ -193,7 +193,7 @@ def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase() -> None:
 
 
 def test_a_message_of_the_library_names_arguments() -> None:
-    """The command line translates them; a page of a sweep shows a command to type."""
+    """The command line translates them; a page of a sweep shows a command to type, a plugin of pytest has options."""
     option = re.compile(r"(?<!pip install)(?:^|[\s'`(])--[a-z]")
     library = (path for path in PYTHON if "cli" not in path.parts and path.name not in ("maps.py", "plugin.py"))
     found = [
