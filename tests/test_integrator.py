@@ -175,6 +175,20 @@ def test_joints_stop_each_at_its_own_limit_and_leave_the_others_alone():
     assert (q[1], v[1]) == pytest.approx((0.5 - 0.25, 0.0), abs=1e-12)
 
 
+def test_joints_that_reach_rigid_stops_within_picoseconds_stop_in_one_event():
+    limits, calls = [(-1.0, 0.05 + i * 1e-13) for i in range(8)], 0
+
+    def acceleration(q, v):
+        nonlocal calls
+        calls += 1
+        return [0.0] * 8
+
+    stops = without_friction(limits, np.eye(8))
+    q, v = integrator.advance(smooth(acceleration), [0.0] * 8, [1.0] * 8, 0.1, stops, 1e-3, 1e-6, 0.1)
+    assert q == [high for _, high in limits] and v == [0.0] * 8
+    assert calls <= 20
+
+
 @pytest.mark.parametrize("h", [1e-3, 1e-2, 0.1])
 def test_a_change_of_rank_is_located(h):
     """q̈ = 3 up to q = 0.05, then −7: polynomials, which the method has exactly."""

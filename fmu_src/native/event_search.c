@@ -26,6 +26,8 @@ static const double DOUBT = 0.25;
 /* Halvings of a step in the search; shorter excursions are ignored. */
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
+/* Fraction of the largest step. Joints that reach rigid stops within it of an event stop with that event. */
+static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
 
 /* A margin at a time within the step, negative after the end of the regime. Some margins have one value for each
    component of the state. */
@@ -306,7 +308,7 @@ static void name_event(Step *step, double passed, const double y[N_STATES], Even
 
 double first_event(Step *step, int rank_held, Event *event)
 {
-    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    const double *value = step->plant->value;
     int near[N_STATES];
     const double change = sweep(step, near);
     const int near_rank = !(fmax(step->margin, step->margin_new) > change);
@@ -316,10 +318,11 @@ double first_event(Step *step, int rank_held, Event *event)
     if (!any)
         return 0.0;
     interpolate(step);
-    double first = HUGE_VAL;
-    for (int i = 0; i < N_STATES; i++)
-        if (near[i])
-            first = fmin(first, first_crossing(step, i < N_JOINTS ? limit_margin : slip_margin, i));
+    double first = HUGE_VAL, crossing[N_STATES];
+    for (int i = 0; i < N_STATES; i++) {
+        crossing[i] = near[i] ? first_crossing(step, i < N_JOINTS ? limit_margin : slip_margin, i) : HUGE_VAL;
+        first = fmin(first, crossing[i]);
+    }
     first = fmin(first, first_release(step, first));
     if (near_rank)
         first = fmin(first, search(step, singular_margin, rank_held,
@@ -332,9 +335,11 @@ double first_event(Step *step, int rank_held, Event *event)
     interpolated(step, first, reached);
     name_event(step, first, reached, event);
     memcpy(step->y_new, reached, sizeof reached);
+    const double last = first + (value[RIGID_STOPS] != 0.0 ? TOGETHER * value[MAX_STEP] : 0.0);
     for (int i = 0; i < N_JOINTS; i++) {
+        event->stopped[i] |= last > first && crossing[i] <= last;
         if (event->stopped[i])
-            step->y_new[i] = fmin(fmax(reached[i], low[i]), high[i]);
+            step->y_new[i] = value[is_above(step->plant, reached[i], i) ? Q_MAX + i : Q_MIN + i];
         if (event->arrested[i])
             step->y_new[N_JOINTS + i] = 0.0;
     }

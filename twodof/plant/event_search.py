@@ -28,6 +28,8 @@ their range.
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
 TIME_RESOLUTION = 2.0**-52
+TOGETHER = 2.0**-25
+"""Fraction of the largest step. Joints that reach rigid stops within it of an event stop with that event."""
 THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
 
 

@@ -115,8 +115,7 @@ class _Motion:
         """Integrate from t, with ẏ at y, until an event or the end; return the time, the state and the event."""
         if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
             return end, y, events.Event()  # inputs and all joints are held: nothing changes
-        step = min(self.max_step, end - t)
-        growth = MAX_FACTOR
+        step, growth = min(self.max_step, end - t), MAX_FACTOR
         while True:
             last = t + step * (1 + 1e-9) >= end
             if last:
@@ -184,10 +183,11 @@ class _Motion:
             return None
         weights = CUBIC if self._stiff else P
         state = interpolant(y, y_new, K, weights, step)
-        first = inf
+        crossings = {}
         for i in near:
             slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(weights).tolist())]
-            first = min(first, events.first_crossing(self._margin_of(i, state), slope, step))
+            crossings[i] = events.first_crossing(self._margin_of(i, state), slope, step)
+        first = min(crossings.values(), default=inf)
 
         def grips(passed: float) -> list[float]:
             return self.acceleration(state(passed))[1]
@@ -204,7 +204,8 @@ class _Motion:
             first = min(first, events.search(singular_margin, pace, 0.0, a, step, b, step))
         if first == inf:
             return None
-        return first, *self._event(state(first))
+        last = first + events.TOGETHER * self.max_step if stops.rigid else -inf
+        return first, *self._event(state(first), [i for i in crossings if i < n and crossings[i] <= last])
 
     def _may_be_arrested(self, i: int, y: State, step: float, K: list[State]) -> bool:
         """Return whether the velocity of a slipping joint may cross 0 within a step."""
@@ -226,7 +227,7 @@ class _Motion:
 
         return distance
 
-    def _event(self, y: State) -> tuple[State, events.Event]:
+    def _event(self, y: State, together: Sequence[int]) -> tuple[State, events.Event]:
         """Return a state with positions clipped to limits and reversed velocities set to 0, and its event."""
         y, n, stops, event = list(y), self.n, self.stops, events.Event()
         if stops.watched:
@@ -236,9 +237,9 @@ class _Motion:
             if i in stops.held:
                 continue
             side = (y[i] >= high) - (y[i] <= low)
-            if not low <= y[i] <= high or side * y[n + i] > 0.0:
+            if not low <= y[i] <= high or side * y[n + i] > 0.0 or i in together:
                 event.stopped.append(i)
-                y[i] = min(max(y[i], low), high)
+                y[i] = high if high - y[i] <= y[i] - low else low
             if stops.slip[i] * y[n + i] < 0.0:
                 event.arrested.append(i)
                 y[n + i] = 0.0
