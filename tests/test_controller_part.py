@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import fmpy.validation
 import numpy as np
 import pytest
+from fmpy.ssp.simulation import simulate_ssp
+from harness import in_child_process
 from systems import component, connection, loop, ssd
+from tools import needs
 
 import twodof
 from twodof.errors import BuildError
@@ -116,3 +120,76 @@ def test_a_controller_is_native_and_has_a_law(tmp_path: Path) -> None:
             twodof.FmuOptions(part="controller", **options)
     with pytest.raises(BuildError, match="`part` 'law' is unknown"):
         twodof.FmuOptions(part="law")
+
+
+@pytest.fixture(scope="module")
+def ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The split default arm, whose controller has a period."""
+    options = twodof.FmuOptions(part="split", settings={"control_period": 0.01, "payload": 0.1, "Kp": 60.0})
+    return twodof.build_fmu(tmp_path_factory.mktemp("ssp") / "arm.ssp", options)
+
+
+def test_a_split_robot_is_the_whole(ssp: Path, tmp_path: Path) -> None:
+    """Each start value goes to the FMU that has it; names are those of the whole."""
+    settings = {"payload": 0.1, "Kp": 60.0, "control_period": 0.01}
+    whole = twodof.build_fmu(tmp_path / "whole.fmu", twodof.FmuOptions(native=True, settings=settings))
+    expected = q_of(whole, **TARGETS["task"])
+    np.testing.assert_allclose(q_of(ssp, **TARGETS["task"]), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(q_of(ssp, controller__x_des=(0.25, 0.1)), expected, rtol=0, atol=1e-12)
+    summary = twodof.simulate(ssp, settings=TARGETS["task"])
+    assert summary.verdict.lines == twodof.simulate(whole, settings=TARGETS["task"]).verdict.lines
+    starts = twodof.load_fmu(ssp).start_values
+    assert (starts["controller.control_period"], starts["control_period"]) == (0.01, 0.0)
+    assert (starts["controller.payload"], starts["payload"], starts["rigid_stops"]) == (0.1, 0.1, False)
+
+
+def test_a_split_robot_is_built_again_byte_by_byte(ssp: Path, tmp_path: Path) -> None:
+    options = twodof.FmuOptions(part="split", settings={"control_period": 0.01, "payload": 0.1, "Kp": 60.0})
+    again = twodof.build_fmu(tmp_path / "arm.ssp", options)
+    assert again.read_bytes() == ssp.read_bytes()
+    twodof.build_fmu(again, options)
+    with pytest.raises(BuildError, match="is another file, and is not replaced"):
+        twodof.build_fmu(again, twodof.FmuOptions(part="split"))
+    with pytest.raises(BuildError, match=r"FMUs of FMI 2\.0"):
+        twodof.FmuOptions(part="split", control="effort")
+
+
+def test_fmpy_runs_a_split_robot(tmp_path: Path) -> None:
+    """FMPy passes outputs on a step later: the motion differs by what is lost of order 1."""
+    path = twodof.build_fmu(tmp_path / "arm.ssp", twodof.FmuOptions(part="split"))
+    ends = {}
+    for h in (0.01, 0.005):
+        rows = simulate_ssp(path, stop_time=1.0 - h / 2, step_size=h)
+        theirs = [rows[f"plant.q[{i}]"][-1] for i in (1, 2)]
+        ends[h] = np.abs(np.subtract(theirs, [*twodof.samples(path, step=h, stop_time=1.0)][-1].q)).max()
+    assert 1e-6 < ends[0.01] < 5e-3
+    assert 1.6 < ends[0.01] / ends[0.005] < 2.4, ends
+
+
+def test_libcosim_runs_a_split_robot(tmp_path: Path) -> None:
+    needs("libcosimpy")
+    needs("libatomic")
+    in_libcosim(tmp_path)
+
+
+@in_child_process
+def in_libcosim(tmp_path: Path) -> None:
+    """It, too, passes outputs on a step later."""
+    from libcosimpy.CosimExecution import CosimExecution
+    from libcosimpy.CosimObserver import CosimObserver
+
+    path = twodof.build_fmu(tmp_path / "arm.ssp", twodof.FmuOptions(part="split"))
+    references = {v.name: v.reference for v in twodof.load_fmu(path).components["plant"].variables.values()}
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / "arm")
+    ends = {}
+    for h in (0.01, 0.005):
+        run = CosimExecution.from_ssp_file(ssp_path=str(tmp_path / "arm"), step_size=round(h * 1e9))
+        last = CosimObserver.create_last_value()
+        run.add_observer(last)
+        assert run.simulate_until(1_000_000_000)
+        plant = run.slave_index_from_instance_name("plant")
+        theirs = last.last_real_values(plant, [references[f"q[{i}]"] for i in (1, 2)])
+        ends[h] = np.abs(np.subtract(theirs, [*twodof.samples(path, step=h, stop_time=1.0)][-1].q)).max()
+    assert 1e-6 < ends[0.01] < 5e-3
+    assert 1.6 < ends[0.01] / ends[0.005] < 2.4, ends

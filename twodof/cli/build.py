@@ -57,6 +57,8 @@ def add(build: argparse.ArgumentParser) -> None:
         default="all",
         help="robot under its control law, or the control law alone, as a native FMU (%(default)s)",
     )
+    split = "build plant and controller as two native FMUs, connected in an SSP file"
+    option("--split", action="store_const", dest="part", const="split", help=split)
     flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
@@ -101,6 +103,10 @@ def call(options: argparse.Namespace) -> int:
     with busy("building", silent=True):
         path = _build(options)
     if not path.is_file():  # a pipe, from which nothing is read back
+        return 0
+    if options.part == "split":
+        print_table(("system", f"{path} ({path.stat().st_size / 1024:.0f} KB)"))
+        print_next(f"twodof run {quote(path)}", f"twodof info {quote(path)}")
         return 0
     from ..fmu import load_any_fmu
 

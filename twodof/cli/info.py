@@ -189,7 +189,7 @@ def _print_head(fmu: Fmu) -> None:
 
 
 def _print_system(system: System) -> None:
-    robot, parts = system.prefix.removesuffix("."), system.components.items()
+    robot, parts = system.recorded, system.components.items()
     print_table(
         ("system", f"{system.path} ({system.name})"),
         ("digest", system.guid),

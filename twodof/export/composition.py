@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ..errors import BuildError, InputError, choice
@@ -159,7 +160,7 @@ class _Variables(NamedTuple):
 
     variables: Mapping[str, Variable]
     control: str
-    prefix: str = ""
+    aliases: Mapping[str, str] = MappingProxyType({})
 
 
 def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:

@@ -30,7 +30,8 @@ class FmuOptions:
         settings: start values of variables by name, as in ``experiment``.
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".
-        part: "all", or "controller": the control law alone, with inputs q and v and outputs tau_cmd; native.
+        part: "all"; "controller": the control law alone, native, with inputs q and v and outputs tau_cmd; or "split":
+            a system of plant and controller, two native FMUs of FMI 2.0 in an SSP file.
         name: model name and identifier; "": name of the URDF's file, "TwoDof" for the shipped arm.
         link_environment: store the folders of this Python's packages in the FMU; not for the native
             flavour, which needs no Python.
@@ -73,9 +74,11 @@ class FmuOptions:
                 raise BuildError(f"`{name}` is the number {value:g}; give all its elements, in a tuple")
         if not isinstance(self.lock, Mapping):
             raise BuildError(f"`lock` is {self.lock!r:.50}; give positions by joint, as {{'joint1': 0.0}}")
-        if self.part not in ("all", "controller"):
-            raise BuildError(f"`part` '{self.part}' is unknown; it is 'all' or 'controller'")
-        if self.part == "controller" and self.reference:
+        if self.part not in ("all", "controller", "split"):
+            raise BuildError(f"`part` '{self.part}' is unknown; it is 'all', 'controller' or 'split'")
+        if self.part == "split" and (self.fmi == 3 or self.control == "effort"):
+            raise BuildError("a split robot has FMUs of FMI 2.0, `fmi=2`, and a control law other than 'effort'")
+        if self.part != "all" and self.reference:
             raise BuildError("reference trajectories are of the robot under its control law; leave out `reference`")
         if self.part == "controller" and (not self.native or self.control == "effort"):
             raise BuildError("the controller alone is native, `native=True`, and has a control law other than 'effort'")

@@ -28,8 +28,8 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
     """Build an FMU.
 
     Args:
-        output: the file, written completely or not at all; None: ``<name>.fmu`` or ``<name>-native.fmu`` in the
-            working directory.
+        output: the file, written completely or not at all; None: ``<name>.fmu`` or ``<name>-native.fmu``, or
+            ``<name>.ssp`` of a split robot, in the working directory.
         options: options of the build; None: the shipped planar arm in the Python flavour.
         overwrite: replace an existing file. Without it, only an FMU of the shipped arm with default settings is
             replaced, because ``build_fmu()`` makes it again.
@@ -42,6 +42,8 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
             the output; the message names it.
     """
     options = options or FmuOptions()
+    if options.part == "split":
+        return _build_system(output, options, overwrite=overwrite)
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = Path(output if output is not None else default)
     comment = DEFAULT_ARM if options.is_default_arm else b""
@@ -63,9 +65,28 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
                 " it away, or build with another `output` or with `overwrite=True`"
             )
         if made_of or not same:
-            _write_zip(path, {**files, **finish()}, comment)
+            content = _zipped({**files, **finish()}, comment)
+            with refusing(BuildError, f"write '{path}'"):
+                write_file(path, content)
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    return path
+
+
+def _build_system(output: str | Path | None, options: FmuOptions, *, overwrite: bool) -> Path:
+    """Build the system of a plant and its controller; errors as of ``build_fmu``."""
+    from .split import system_files  # as above
+
+    path = Path(output if output is not None else f"{options.name}.ssp")
+    try:
+        files, fmus = system_files(options)
+    except RobotError as error:
+        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    content = _zipped({**files, **{name: _zipped(fmu) for name, fmu in fmus.items()}})
+    with refusing(BuildError, f"write '{path}'"):
+        if path.is_file() and descriptor_of(path) is None and not overwrite and path.read_bytes() != content:
+            raise BuildError(f"'{path}' is another file, and is not replaced: move it away, or use `overwrite=True`")
+        write_file(path, content)
     return path
 
 
@@ -116,8 +137,8 @@ def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str
     return same and refers == reference and built_for == set(platforms)
 
 
-def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
-    """Write sorted entries with fixed dates atomically; equal inputs give equal bytes."""
+def _zipped(files: Mapping[str, bytes], comment: bytes = b"") -> bytes:
+    """Return a zip archive of sorted entries with fixed dates, so that equal inputs give equal bytes."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.comment = comment
@@ -126,5 +147,4 @@ def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, files[name])
-    with refusing(BuildError, f"write '{path}'"):
-        write_file(path, content.getvalue())
+    return content.getvalue()

@@ -38,8 +38,8 @@ class Variables(Protocol):
         """The control law; "" if unknown."""
 
     @property
-    def prefix(self) -> str:
-        """Prefix that names may have, "" for none."""
+    def aliases(self) -> Mapping[str, str]:
+        """Further names, and the names that they stand for."""
 
 
 def vector(variables: Mapping[str, Settable], group: str) -> list[str]:
@@ -69,8 +69,7 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
         raise InputError(f"settings are values by name, as {{'Kp': 80}}, not {settings!r:.50}")
     values: dict[str, Value] = {}
     for name, setting in settings.items():
-        if not vector(fmu.variables, name):
-            name = name.removeprefix(fmu.prefix)
+        name = fmu.aliases.get(name, name)
         elements = [name] if name in fmu.variables else vector(fmu.variables, name)
         if not elements:
             raise InputError(no_variable(fmu, name, "input", "parameter"))

@@ -6,7 +6,7 @@ import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -75,7 +75,7 @@ class Fmu:
         control: name of the control law, e.g. "task"; "" if unknown.
         described: size of its description, bytes.
         inside: name of the FMU's file in the system at ``path``; "" if ``path`` is the FMU.
-        prefix: optional prefix of its variables in settings, e.g. "plant." in a system; "" if none.
+        aliases: further names of variables and vectors, and the names that they stand for; of a system.
     """
 
     path: Path
@@ -91,7 +91,7 @@ class Fmu:
     control: str
     described: int = 0
     inside: str = ""
-    prefix: str = ""
+    aliases: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"
@@ -145,7 +145,7 @@ class Fmu:
 
     def vector(self, group: str) -> list[str]:
         """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
-        return vector(self.variables, group if group in self.variables else group.removeprefix(self.prefix))
+        return vector(self.variables, self.aliases.get(group, group))
 
     def groups(self, causality: str) -> dict[str, list[str]]:
         """Return vectors and scalars of one causality by group name."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
@@ -23,8 +24,9 @@ from .wiring import Link, Node, Wiring, order
 class System(Fmu):
     """A system of co-simulation FMUs, one of which is the robot.
 
-    ``variables`` has the robot's variables and the system's connectors by their own names, and variables of other
-    components as "component.name". A variable that a connection drives has the causality "local".
+    ``variables`` has the system's connectors, the robot's variables, and inputs whose name no other component has, by
+    their own names; other variables of components are "component.name". A variable that a connection drives has the
+    causality "local".
 
     Attributes:
         title: the system's name.
@@ -32,12 +34,14 @@ class System(Fmu):
         components: FMUs by full name.
         links: connections of components' variables with their first sources.
         batches: outputs and inputs in the order of evaluation at one instant.
+        recorded: name of the component that is the robot.
         places: the component's variable, or the system's connector, for each of ``variables``.
         bound: start values of components' variables from parameter bindings.
     """
 
     title: str = ""
     digest: str = ""
+    recorded: str = ""
     components: Mapping[str, Fmu] = field(default_factory=dict)
     links: tuple[Link, ...] = ()
     batches: tuple[tuple[Node, ...], ...] = ()
@@ -121,10 +125,15 @@ def load_system(path: Path, robot: str = "") -> System:
     own: dict[str, Any] = {each.name: getattr(fmus[chosen], each.name) for each in fields(Fmu)}
     description = copy(fmus[chosen].description)
     description.defaultExperiment = times
-    own |= dict(variables=variables, description=description, control="", prefix=f"{chosen}.")
+    aliases: dict[str, str] = {}
+    for name, node in places.items():
+        if (full := str(node)) != name:
+            aliases |= {full: name, full.rpartition("[")[0] or full: name.rpartition("[")[0] or name}
+    own |= dict(variables=variables, description=description, control="", aliases=aliases)
     return System(
         **own,
         title=title,
+        recorded=chosen,
         digest=digest.hexdigest(),
         components=fmus,
         links=tuple(links),
@@ -205,11 +214,13 @@ def _variables(
         start = starts.get(source, default if default is None else link.map.inverse(default))
         add(str(source), source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
     ends = {link.target for link in links}
+    names = Counter(name for fmu in fmus.values() for name in fmu.variables)
     for element in (robot, *(name for name in fmus if name != robot)):
         for scalar in fmus[element].variables.values():
             node = Node(element, scalar.name)
             if scalar.causality in ("input", "output", "parameter"):
-                own = element == robot and scalar.name not in variables
+                alone = scalar.causality == "input" and node not in ends and names[scalar.name] == 1
+                own = (element == robot or alone) and scalar.name not in variables
                 start = starts.get(node, scalar.start_value)
                 causality = "local" if node in ends else scalar.causality
                 add(scalar.name if own else str(node), node, scalar, causality, start)

@@ -1,0 +1,113 @@
+"""Build a system of a plant and its controller: an SSP 1.0 file of two FMUs, their connections and values.
+
+Source: System Structure and Parameterization 1.0, Modelica Association, 2019.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ..plant.variables import CONTROLS
+from ..version import __version__
+from .composition import compose
+from .flavours import Files
+from .fmi3_files import xml_text
+from .fmu_options import FmuOptions
+from .model_description import SENSORS
+
+SSP = "http://ssp-standard.org/SSP1/SystemStructure"
+SSC, SSD, SSV = (f"{{{SSP}{name}}}" for name in ("Common", "Description", "ParameterValues"))
+WIRES = (
+    ("plant", "q", "controller", "q"),
+    ("plant", "v", "controller", "v"),
+    ("controller", "tau_cmd", "plant", "tau_cmd"),
+)
+"""Connections: component and group of the start, and of the end."""
+
+
+def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
+    """Return the files of an SSP but for its FMUs, and the files of each FMU by its path in the SSP.
+
+    The start values of the robot are the plant's, those of the control law, its sampling and sensors the controller's,
+    and what both have is set in both.
+
+    Raises:
+        BuildError, RobotError: naming the culprit.
+    """
+    law = CONTROLS[options.control]
+    of_law = {*law.inputs, *law.parameters, *SENSORS, "control_period", "control_delay"}
+    of_plant = {name: value for name, value in options.settings.items() if name.partition("[")[0] not in of_law}
+    options = replace(options, native=True, fmi=2)
+    parts = {
+        "plant": replace(
+            options,
+            part="all",
+            control="effort",
+            name=f"{options.name}_plant",
+            settings={"rigid_stops": law.rigid_stops, **of_plant},
+        ),
+        "controller": replace(options, part="controller", name=f"{options.name}_controller"),
+    }
+    fmus, tables = {}, {}
+    for name, part in parts.items():
+        _, files, finish = compose(part)
+        fmus[f"resources/{name}.fmu"] = {**files, **finish()}
+        root = ET.fromstring(files["modelDescription.xml"])
+        tables[name] = {v.get("name", ""): v for v in root.iterfind("ModelVariables/ScalarVariable")}
+    return {
+        "SystemStructure.ssd": _structure(options.name, tables),
+        **{f"resources/{name}.ssv": _values(name, table) for name, table in tables.items()},
+    }, fmus
+
+
+def _structure(title: str, tables: Mapping[str, Mapping[str, ET.Element]]) -> bytes:
+    """Return the text of SystemStructure.ssd.
+
+    Connectors are those that a connection or an observer needs: importers give unconnected inputs wrong sources, or
+    refuse connectors of the system.
+    """
+    root = ET.Element(f"{SSD}SystemStructureDescription", version="1.0", name=title)
+    root.set("generationTool", f"twodof {__version__}")
+    system = ET.SubElement(root, f"{SSD}System", name=title)
+    wires = [
+        (start, name, end, name.replace(group, other))
+        for start, group, end, other in WIRES
+        for name in tables[start]
+        if name.partition("[")[0] == group
+    ]
+    elements = ET.SubElement(system, f"{SSD}Elements")
+    for part, table in tables.items():
+        component = ET.SubElement(elements, f"{SSD}Component", name=part, source=f"resources/{part}.fmu")
+        component.set("type", "application/x-fmu-sharedlibrary")
+        connectors = ET.SubElement(component, f"{SSD}Connectors")
+        driven = {name for _, _, end, name in wires if end == part}
+        for name, variable in table.items():
+            if name in driven or variable.get("causality") == "output":
+                kind = variable.get("causality", "")
+                connector = ET.SubElement(connectors, f"{SSD}Connector", name=name, kind=kind)
+                ET.SubElement(connector, f"{SSC}{variable[0].tag}")
+        bindings = ET.SubElement(component, f"{SSD}ParameterBindings")
+        ET.SubElement(bindings, f"{SSD}ParameterBinding", source=f"resources/{part}.ssv")
+    connections = ET.SubElement(system, f"{SSD}Connections")
+    for start, own, end, other in wires:
+        ends = dict(startElement=start, startConnector=own, endElement=end, endConnector=other)
+        ET.SubElement(connections, f"{SSD}Connection", ends)
+    ET.SubElement(root, f"{SSD}DefaultExperiment", startTime="0.0", stopTime="5.0")
+    return _text(root)
+
+
+def _values(name: str, table: Mapping[str, ET.Element]) -> bytes:
+    """Return the parameter set of a component: the start values of its parameters and inputs."""
+    root = ET.Element(f"{SSV}ParameterSet", version="1.0", name=name)
+    parameters = ET.SubElement(root, f"{SSV}Parameters")
+    for own, variable in table.items():
+        if variable.get("causality") in ("parameter", "input") and (start := variable[0].get("start")) is not None:
+            parameter = ET.SubElement(parameters, f"{SSV}Parameter", name=own)
+            ET.SubElement(parameter, f"{SSV}{variable[0].tag}", value=start)
+    return _text(root)
+
+
+def _text(root: ET.Element) -> bytes:
+    for prefix, name in (("ssc", SSC), ("ssd", SSD), ("ssv", SSV)):
+        ET.register_namespace(prefix, name[1:-1])
+    return xml_text(root)
