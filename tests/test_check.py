@@ -9,11 +9,14 @@ from pathlib import Path
 
 import fmpy
 import pytest
+from systems import loop, pd_fmu
 from tools import needs
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import InputError
 from twodof.fmu import checking
+from twodof.fmu.trials import TRIALS
 
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="Foreign" guid="1" numberOfEventIndicators="0">
@@ -75,15 +78,16 @@ def test_fmus_of_this_project_pass(kind: str, tmp_path: Path, fmu_path: Path, na
     check = twodof.check(path)
     outcomes = {row.name: row.outcome for row in check.rows}
     assert {name for name, outcome in outcomes.items() if outcome != "passed"} == (
-        {"derivatives"} if kind == "python" else set()
+        {"references", "derivatives"} if kind == "python" else {"references"}
     ), str(check)
-    assert len(outcomes) == 10 and check.passed
+    assert len(outcomes) == 11 and check.passed
 
 
 def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
     check = twodof.check(foreign(tmp_path))
-    assert [(row.name, row.outcome) for row in check.rows if row.outcome != "passed"] == [("call order", "remark")]
-    assert check.rows[-1].text.startswith(REMARK)
+    others = {row.name: row.outcome for row in check.rows if row.outcome != "passed"}
+    assert others == {"call order": "remark", "references": "does not apply"}
+    assert check.rows[-2].text.startswith(REMARK)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -94,7 +98,7 @@ def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
     assert failed(check)[row].startswith(text)
     if fault not in ("NOT_FINITE", "DISCARDS"):
         assert {*failed(check)} == {row, *ALSO.get(fault, ())}
-    assert not check.passed and len(check.rows) == 10
+    assert not check.passed and len(check.rows) == 11
 
 
 def test_a_call_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,6 +128,7 @@ def test_what_the_description_does_not_claim_does_not_apply(tmp_path: Path) -> N
         "serialised state": "it does not state canGetAndSetFMUstate",
         "variable steps": "it does not state canHandleVariableCommunicationStepSize",
         "derivatives": "it does not state providesDirectionalDerivative",
+        "references": "it carries no experiments with results in the form of FMI-LS-REF",
     }
 
 
@@ -161,3 +166,17 @@ def test_the_command_prints_a_table_or_json(
     with pytest.raises(SystemExit) as ended:
         main(["check"])
     assert ended.value.code == 2
+
+
+def test_each_fmu_of_a_system_is_checked(tmp_path: Path) -> None:
+    """A plant of this project and a controller of another maker, which reads with no state of its own."""
+    plant = twodof.build_fmu(tmp_path / "plant.fmu", twodof.FmuOptions(native=True, control="effort"))
+    path = loop(tmp_path / "loop.ssp", plant.read_bytes(), pd_fmu())
+    check = twodof.check(path)
+    assert check.rows[0] == ("structure", "passed", "2 components, 6 connections")
+    outcomes = {row.name: row.outcome for row in check.rows}
+    assert {outcomes[f"plant: {name}"] for name in TRIALS} == {"passed"}
+    assert outcomes["pd: reset"] == outcomes["pd: simulation"] == "passed", str(check)
+    assert outcomes["pd: state"] == "does not apply"
+    with pytest.raises(InputError, match="check its FMUs one by one"):
+        twodof.check(path, tools=["fmpy"])

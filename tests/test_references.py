@@ -45,7 +45,8 @@ def packed(files: dict[str, bytes], path: Path) -> Path:
 
 def rows(path: Path, *tools: str) -> dict[str, checking.Row]:
     """The rows of references alone."""
-    return {row.name: row for row in checking._tried(path, checking._runs(load_any_fmu(path), tools))}
+    fmu = load_any_fmu(path)
+    return {row.name: row for row in checking._tried(fmu, checking._runs(fmu, tools))}
 
 
 def test_the_files_have_the_form_of_the_standards(built: Path) -> None:

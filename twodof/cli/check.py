@@ -9,7 +9,7 @@ from .printing import busy, print_json, print_table, say
 def add(check: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     check.description = "Check an FMU of any vendor; exit status 1 if a row fails."
-    check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0")
+    check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0, or SSP file")
     check.add_argument(
         "--with",
         dest="tools",

@@ -14,10 +14,13 @@ from typing import NamedTuple
 from ..bounds import MAX_CALL_WAIT, MAX_ROW
 from ..children import Child
 from ..errors import FmuError, InputError
+from ..export.package import has_member
 from ..notebook import card
 from .description import Fmu, load_any_fmu, problems_of
 from .importers import require
-from .reference_runs import references_of
+from .reference_runs import Reference, references_of
+from .ssp_file import STRUCTURE, read_ssp
+from .system import load_system
 from .trials import TRIALS, Trial, UnpassedError, reference_run
 
 REFERENCE, WITH = "reference ", " with "
@@ -73,7 +76,8 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
     run.
 
     Args:
-        fmu: an FMI 2.0 or 3.0 co-simulation FMU with a binary for this machine.
+        fmu: an FMI 2.0 or 3.0 co-simulation FMU with a binary for this machine; or an SSP 1.0 file, each of whose FMUs
+            is checked.
         tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos" or "fmuloader".
 
     Raises:
@@ -82,19 +86,41 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
     """
     path = Path(fmu)
     require(tools)
-    problems = problems_of(path)
+    if not has_member(path, STRUCTURE):
+        return Check(path, tuple(_rows(path, "", tools)))
+    if tools:
+        raise InputError(f"'{path}' is a system; `tools` run the references of an FMU: check its FMUs one by one")
+    elements = [element for element in read_ssp(path)[1].walk() if element.source]
+    names = {element.source: element.name for element in reversed(elements)}
     try:
-        known = load_any_fmu(path)
+        system = load_system(path)
+        first = Row("structure", "passed", f"{len(system.components)} components, {len(system.links)} connections")
+    except FmuError as error:
+        first = Row("structure", "remark", f"'twodof run' refuses it: {error}")
+    rows = ((name, row) for source, name in names.items() for row in _rows(path, source, ()))
+    return Check(path, (first, *(row._replace(name=f"{name}: {row.name}") for name, row in rows)))
+
+
+def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
+    """Yield the rows of an FMU."""
+    problems = problems_of(path, inside)
+    try:
+        known = load_any_fmu(path, inside)
     except FmuError as error:
         if not problems:
             raise
-        return Check(path, (Row("description", "failed", "; ".join(problems) or str(error)),))
+        yield Row("description", "failed", "; ".join(problems) or str(error))
+        return
     described = f"{len(known.variables)} variables, FMI {known.description.fmiVersion}"
-    first = Row("description", *(("failed", "; ".join(problems)) if problems else ("passed", described)))
+    yield Row("description", *(("failed", "; ".join(problems)) if problems else ("passed", described)))
     if known.platform not in known.platforms:
         reason = f"it has no binary for this machine ({known.platform}), only for: {', '.join(known.platforms)}"
-        return Check(path, (first, *(Row(name, "does not apply", reason) for name in TRIALS)))
-    return Check(path, (first, *_tried(path, [*TRIALS, *_runs(known, tools)])))
+        yield from (Row(name, "does not apply", reason) for name in TRIALS)
+        return
+    runs = _runs(known, tools)
+    yield from _tried(known, [*TRIALS, *runs])
+    if not runs:
+        yield Row("references", "does not apply", "it carries no experiments with results in the form of FMI-LS-REF")
 
 
 def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
@@ -108,12 +134,12 @@ def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
     return [f"{REFERENCE}{name}{tool and WITH + tool}" for name in names for tool in ("", *tools)]
 
 
-def _tried(path: Path, names: Sequence[str]) -> Iterator[Row]:
+def _tried(fmu: Fmu, names: Sequence[str]) -> Iterator[Row]:
     """Yield the row of each trial; after a crash, a new process does the remaining trials."""
     todo = [*names]
     while todo:
         doing = "its start"
-        with Child(_serve, path, todo, output=DEVNULL) as child:
+        with Child(_serve, fmu.path, fmu.inside, todo, output=DEVNULL) as child:
             try:
                 while todo:
                     kind, *words = json.loads(child.receive(MAX_ROW, MAX_CALL_WAIT))
@@ -121,26 +147,29 @@ def _tried(path: Path, names: Sequence[str]) -> Iterator[Row]:
                         yield Row(todo.pop(0), *words)
                     else:
                         (doing,) = words
-            except EOFError as end:
+            except (EOFError, ValueError, TypeError) as end:  # an FMU can write what it likes
                 limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
                 yield Row(todo.pop(0), "failed", f"it ended its process at: {doing}{limit}: {end}")
 
 
-def _serve(pipe: Connection, path: Path, names: Sequence[str]) -> None:
+def _serve(pipe: Connection, path: Path, inside: str, names: Sequence[str]) -> None:
     """Do the trials in the child; send the name of each call before it, and each result."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def send(*words: str) -> None:
         pipe.send_bytes(json.dumps(words).encode()[:MAX_ROW])
 
-    trial = Trial(load_any_fmu(path), lambda what: send("note", what))
+    trial = Trial(load_any_fmu(path, inside), lambda what: send("note", what))
+
+    references: dict[str, Reference] = {}
 
     def result(name: str) -> str:
         if name in TRIALS:
             return TRIALS[name](trial)
         experiment, _, tool = name.removeprefix(REFERENCE).partition(WITH)
-        by_name = {reference.name: reference for reference in references_of(trial.fmu)}
-        return reference_run(trial, by_name[experiment], tool)
+        if not references:
+            references.update({reference.name: reference for reference in references_of(trial.fmu)})
+        return reference_run(trial, references[experiment], tool)
 
     for name in names:
         outcome = "passed"

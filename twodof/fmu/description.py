@@ -210,13 +210,13 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     return fmu
 
 
-def problems_of(path: Path) -> list[str]:
+def problems_of(path: Path, inside: str = "") -> list[str]:
     """Return the faults of an FMU's description in schema, variables, units and model structure.
 
     Raises:
         FmuError: there is no description to read.
     """
-    xml, _ = read_archive(path, "")
+    xml, _ = read_archive(path, inside)
     try:
         read_description(ET.fromstring(xml), xml, validate_variable_names=True, validate_model_structure=True)
     except ValidationError as error:

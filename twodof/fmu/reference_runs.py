@@ -17,7 +17,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_REFERENCE
+from ..bounds import MAX_REFERENCES
 from ..errors import FmuError, SimulationError
 from ..files import read_member
 from .description import Fmu, opened
@@ -119,15 +119,17 @@ def references_of(fmu: Fmu) -> list[Reference]:
     return [reference for reference in found if reference is not None]
 
 
-class _Files(NamedTuple):
+class _Files:
     """Files in the folder of FMI-LS-REF."""
 
-    archive: zipfile.ZipFile
-    folder: str
+    def __init__(self, archive: zipfile.ZipFile, folder: str) -> None:
+        self._archive, self._folder, self._room = archive, folder, MAX_REFERENCES
 
     def read(self, source: str) -> bytes:
         """Return a file by its relative URI."""
-        return read_member(self.archive, posixpath.normpath(f"{self.folder}/{unquote(source)}"), MAX_REFERENCE)
+        content = read_member(self._archive, posixpath.normpath(f"{self._folder}/{unquote(source)}"), self._room)
+        self._room -= len(content)
+        return content
 
     def xml(self, source: str) -> ET.Element:
         """Return the root of an XML file."""
