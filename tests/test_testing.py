@@ -42,8 +42,10 @@ def test_settling_is_that_of_the_error(runs: dict[str, Path]) -> None:
         assert_settles(bag, within=outside)
     (time,) = re.findall(r"settles after ([\d.]+) s, and is to settle within", str(caught.value))
     assert 0.0 < float(time) - outside <= 0.0101
-    with pytest.raises(AssertionError, match="the run does not settle"):
-        assert_settles(runs["slow"], within=3.0)
+    slow = twodof.read_bag(runs["slow"])
+    off = float(((slow.x[300] - (0.2, 0.05)) ** 2).sum() ** 0.5)
+    with pytest.raises(AssertionError, match=rf"does not settle, .* at 3 s its error is {off:.3g};"):
+        assert_settles(slow, within=3.0)
 
 
 def test_a_limit_that_is_exceeded_is_named(tmp_path: Path, native_path: Path) -> None:
@@ -107,7 +109,7 @@ def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path: Path, native_p
     assert "and is to settle within 1 s" in done.stdout
     (plot,) = (tmp_path / "report").iterdir()
     assert plot.name == "test_arm.py_test_late.html" and str(plot) in done.stdout
-    assert plot.read_text().count("<polyline") == 2
+    assert plot.read_text().count("<polyline") == 1
 
 
 def test_the_plugin_imports_nothing_heavy(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ def assert_settles(run: Recording | str | Path, *, within: float) -> None:
         AssertionError: it does not settle, settles later, or has no target.
         BagError: the bag cannot be read.
     """
+    __tracebackhide__ = True
     bag = _recording(run)
     verdict = bag.verdict
     settling = verdict.numbers.get("settling_time")
@@ -44,7 +45,10 @@ def assert_settles(run: Recording | str | Path, *, within: float) -> None:
     if not settling <= within:
         took = f"settles after {settling:.4g} s" if settling < float("inf") else "does not settle"
         curves = bag.x - bag.target if bag.target.size and bag.x.size else bag.held("q_des", bag.q.shape[1]) - bag.q
-        _fail(bag, f"the run {took}, and is to settle within {within:g} s; {verdict}", [*curves.T], "error")
+        error = (curves**2).sum(axis=1) ** 0.5
+        k = min(int(bag.t.searchsorted(within)), len(error) - 1)
+        text = f"the run {took}, and is to settle within {within:g} s; at {bag.t[k]:.6g} s its error is {error[k]:.3g}"
+        _fail(bag, f"{text}; {verdict}", [error], "distance from the target")
 
 
 def assert_within_limits(run: Recording | str | Path) -> None:
@@ -58,6 +62,7 @@ def assert_within_limits(run: Recording | str | Path) -> None:
     """
     import numpy as np
 
+    __tracebackhide__ = True
     bag = _recording(run)
     setup = bag.setup
     effort, velocity = np.array(setup.limits.effort), np.array(setup.limits.velocity)
@@ -96,6 +101,7 @@ def assert_equal(run: Recording | str | Path, reference: Recording | str | Path,
     """
     import numpy as np
 
+    __tracebackhide__ = True
     bag, other = _recording(run), _recording(reference)
     if bag.joints != other.joints:
         _fail(bag, f"the joints are {', '.join(bag.joints)}, and of the reference {', '.join(other.joints)}", [])
@@ -120,6 +126,7 @@ def _recording(run: Recording | str | Path) -> Recording:
 
 def _fail(bag: Recording, text: str, curves: Sequence[Any], label: str = "") -> NoReturn:
     """Raise the assertion's error, with the plot's path."""
+    __tracebackhide__ = True
     if REPORT and curves:
         from ..notebook import card, picture
 
@@ -128,6 +135,7 @@ def _fail(bag: Recording, text: str, curves: Sequence[Any], label: str = "") -> 
         path = REPORT[-1] / f"{name[:100]}.html"
         path.parent.mkdir(parents=True, exist_ok=True)
         plot = picture(((bag.t, curve) for curve in curves), "t in s", label)
-        path.write_text(f'<!DOCTYPE html><meta charset="utf-8">{card(test, {"bag": bag.path, "failure": text}, plot)}')
+        page = f'<!DOCTYPE html><meta charset="utf-8">{card(test, {"bag": bag.path, "failure": text}, plot)}'
+        path.write_text(page, encoding="utf-8")
         text += f"\nplot: {path}"
     raise AssertionError(f"'{bag.path}': {text}")
