@@ -16,10 +16,12 @@ from .stretches import Array, Stretch
 
 PRIOR = 3.0
 """Standard deviation, in scales, of the weak prior, which fixes directions that the data do not determine."""
-TOLERANCE = 1e-10
+TOLERANCE, STEPS, LAST_STEPS = 1e-8, 15, 40
+"""Relative tolerance of a solution, and its most steps, before the last estimate of noise and after it."""
 PASSES, FIRST_NOISE = 6, 0.02
 """Number of estimates of the noise variances, and the initial noise, as a fraction of the efforts."""
-DELAY_SCALE = 0.02  # s
+DELAY_SCALE, LARGEST_SHIFT = 0.02, 5e-4
+"""Scale of the delay, and its largest change without new rows, s."""
 FEWEST = 20  # rows for the estimate of a bin's noise
 PRIOR_SHARE = 0.1
 """Share of the prior in the variance of a value, above which the data do not determine the value."""
@@ -63,6 +65,7 @@ class Estimate(NamedTuple):
         noise: standard deviation of the efforts' noise, N·m or N, n.
         misfits: comparison of residuals for each joint.
         evaluations: number of evaluations of the residuals.
+        converged: False if the last solution still moved after its most steps.
     """
 
     x: Array
@@ -74,6 +77,7 @@ class Estimate(NamedTuple):
     noise: Array
     misfits: tuple[Misfit, ...]
     evaluations: int
+    converged: bool
 
 
 def estimate(parameters: Parameters, stretches: Sequence[Stretch]) -> Estimate:
@@ -86,15 +90,17 @@ def estimate(parameters: Parameters, stretches: Sequence[Stretch]) -> Estimate:
     sd: list[Array] = []
     relinearise = any(free.group == "offset" for free in parameters.free)
     for k in range(PASSES):
-        if k in (0, 3) or relinearise:
+        if not rows or relinearise or abs(z[-1] - rows[0].about[1]) > LARGEST_SHIFT:
             about = parameters.dynamics(parameters.values(z[:-1]))
             rows = rows_of(parameters.robot, about, stretches, float(z[-1]), relinearise)
         sd = sd or [np.full(len(each.tau), FIRST_NOISE * np.sqrt(np.mean(each.tau**2))) for each in rows]
-        solved = _solve(parameters, rows, sd, z, start, low, scales)
+        steps = LAST_STEPS if k == PASSES - 1 else STEPS
+        solved = _solve(parameters, rows, sd, z, start, low, scales, steps)
         z, evaluations = solved.x, evaluations + solved.nfev
         dynamics = parameters.dynamics(parameters.values(z[:-1]))
         sd = [_deviations(each, residual(each, dynamics, float(z[-1]))) for each in rows]
-    return _result(parameters, rows, sd, z, scales, evaluations)
+    converged = bool(solved.status > 0 and abs(z[-1] - rows[0].about[1]) <= LARGEST_SHIFT)
+    return _result(parameters, rows, sd, z, scales, evaluations, converged)
 
 
 def _typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
@@ -105,7 +111,14 @@ def _typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
 
 
 def _solve(
-    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, start: Array, low: Array, scales: Array
+    parameters: Parameters,
+    rows: Sequence[Rows],
+    sd: Sequence[Array],
+    z: Array,
+    start: Array,
+    low: Array,
+    scales: Array,
+    steps: int,
 ) -> Any:
     """Return SciPy's least-squares result for the whitened rows and the weak prior."""
 
@@ -118,9 +131,8 @@ def _solve(
         return np.vstack([_information_root(parameters, rows, sd, z), np.diag(1.0 / (PRIOR * scales))])
 
     inside = np.maximum(z, low + 1e-9 * scales)
-    return least_squares(
-        errors, inside, rates, bounds=(low, np.inf), x_scale=scales, xtol=1e-10, ftol=1e-10, gtol=1e-10
-    )
+    options = dict(bounds=(low, np.inf), x_scale=scales, max_nfev=steps)
+    return least_squares(errors, inside, rates, xtol=TOLERANCE, ftol=TOLERANCE, gtol=TOLERANCE, **options)
 
 
 def _information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:
@@ -141,7 +153,13 @@ def _deviations(rows: Rows, errors: Array) -> Array:
 
 
 def _result(
-    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, scales: Array, evaluations: int
+    parameters: Parameters,
+    rows: Sequence[Rows],
+    sd: Sequence[Array],
+    z: Array,
+    scales: Array,
+    evaluations: int,
+    converged: bool,
 ) -> Estimate:
     J = _information_root(parameters, rows, sd, z) * scales
     strengths, directions = np.linalg.eigh(J.T @ J)
@@ -167,6 +185,7 @@ def _result(
         noise=noise,
         misfits=tuple(misfits),
         evaluations=evaluations,
+        converged=converged,
     )
 
 

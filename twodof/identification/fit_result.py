@@ -60,6 +60,7 @@ class Fit:
             held-out stretches, rad or m, before and after the fit; empty if no stretch is long enough.
         settings: fitted values that a URDF cannot store, by variable of the FMU.
         covariance: covariance of the parameters, in their order.
+        converged: False if the solution still moved when its steps ended.
     """
 
     urdf: str
@@ -74,6 +75,7 @@ class Fit:
     deviation: tuple[float, ...]
     settings: Mapping[str, tuple[float, ...]]
     covariance: NDArray[np.float64]
+    converged: bool
 
     @property
     def explains(self) -> bool:
@@ -93,6 +95,8 @@ class Fit:
     def remarks(self) -> list[str]:
         """Warnings and results, one line each."""
         lines = []
+        if not self.converged:
+            lines.append("the fit has not converged: free fewer parameters, or record more motion")
         if self.unseen:
             lines.append(f"the data do not tell: {'; '.join(self.unseen)}")
         if bad := [misfit for misfit in self.misfits if misfit.bad]:
@@ -134,6 +138,7 @@ class Fit:
             "parameters": [p._asdict() for p in self.parameters],
             "unseen": self.unseen,
             "explains": self.explains,
+            "converged": self.converged,
             "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
             "noise": dict(zip(self.joints, self.noise)),
             "delay": {"value": self.delay[0], "deviation": self.delay[1]},

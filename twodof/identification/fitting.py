@@ -136,6 +136,7 @@ def _result(path: Path, text: str, urdf: Urdf, parameters: Parameters, found: Es
         deviation=tuple(rms[1]),
         settings=_settings(parameters, after, found),
         covariance=found.covariance,
+        converged=found.converged,
     )
 
 
