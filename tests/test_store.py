@@ -179,7 +179,7 @@ def test_no_robot_comes_late(fmus: dict[str, Path], tmp_path: Path) -> None:
     with early:
         for sample in twodof.samples(run):
             early.write(sample)
-        with pytest.raises(BagError, match="takes no robot any more"), late:
+        with pytest.raises(BagError, match="accepts no further robot"), late:
             raise AssertionError
     assert read_bag(f"{bag.path}:early").count == 51
 
@@ -205,7 +205,7 @@ def test_a_robot_that_comes_after_the_others_replaces_none(fmus: dict[str, Path]
     bag = twodof.Bag(tmp_path / "bag", overwrite=True)
     for _ in range(2):  # the same run again may replace itself
         twodof.simulate(run, bag.of("early"))
-    with pytest.raises(BagError, match="takes no robot any more"):
+    with pytest.raises(BagError, match="accepts no further robot"):
         twodof.simulate(run, bag.of("late"))
     assert read_bag(f"{bag.path}:early").count == 51
 

@@ -223,7 +223,7 @@ def test_joints_of_another_robot_are_left_out(arm: Path, tmp_path: Path, caplog:
         bag = write(tmp_path / name, (0.0, command))
         last = twodof.read_commands(arm, bag)[-1][1]
         assert (last["q_des[2]"], last["v_des[2]"]) == (0.2, 0.0)
-        told = "joints that this robot has not are left out: 'elbow, finger'"
+        told = "joints that this robot does not have are ignored: 'elbow, finger'"
         assert caplog.messages == [f"'{bag}': {told}"]
         caplog.clear()
 

@@ -194,7 +194,7 @@ def whole_bag(path: Path) -> list[Path]:
     if files != [path] and not (path / "metadata.yaml").is_file():
         if is_being_written(path):
             raise BagError(f"the bag '{path}' is still being written")
-        raise BagError(f"the bag '{path}' is unfinished: its writer died; make it whole with 'twodof recover {path}'")
+        raise BagError(f"the bag '{path}' is unfinished: its writer died; repair it with 'twodof recover {path}'")
     return files
 
 

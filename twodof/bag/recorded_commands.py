@@ -139,7 +139,7 @@ def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read],
             raise InputError(f"{bag}: the command at {t:g} s {error}") from error
     if names := {name for _, command in read_so_far for name in command.unknown_joints}:
         unknown_joints = ", ".join(sorted(names))[:LONGEST_NAME]
-        LOG.warning(f"{bag}: joints that this robot has not are left out: {unknown_joints!r}")
+        LOG.warning(f"{bag}: joints that this robot does not have are ignored: {unknown_joints!r}")
     return read_so_far
 
 

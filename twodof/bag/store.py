@@ -81,7 +81,7 @@ class Store:
 
     def _enter(self, part: Part) -> None:
         if self._begun if self._entered else self._names and part.namespace not in self._names:
-            raise BagError(f"the bag '{self.path}' has begun, and takes no robot any more")
+            raise BagError(f"the bag '{self.path}' has begun and accepts no further robot")
         names = [part.namespace for part in (*self._parts, part)]
         if len(names) > len(set(names)) or ("" in names and len(names) > 1):
             raise BagError(f"the robots of the bag '{self.path}' need namespaces that differ")

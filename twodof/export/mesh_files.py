@@ -117,4 +117,4 @@ def _inside(path: Path, files: dict[str, bytes]) -> str:
         name = "/".join(("meshes", *parts[-depth:]))
         if name not in files:
             return name
-    raise BuildError(f"mesh '{path}' has no name that is free")
+    raise BuildError(f"there is no free name for mesh '{path}'")

@@ -181,7 +181,7 @@ def _received(reader: Child) -> list[Surface]:
     try:
         answer = parsed(reader.receive(200 * MAX_SURFACES, MAX_MESH_WAIT))
     except (ValueError, RecursionError) as error:
-        raise _AnswerError(f"its answer is none: {error}") from None
+        raise _AnswerError(f"its answer is invalid: {error}") from None
     if isinstance(answer, str):
         raise ValueError(answer[:500])
     if not fits(answer, [(int, int, NUMBER, NUMBER, NUMBER)]) or any(min(row[:2]) < 0 for row in answer):

@@ -98,7 +98,7 @@ class Fit:
         if not self.converged:
             lines.append("the fit has not converged: free fewer parameters, or record more motion")
         if self.unseen:
-            lines.append(f"the data do not tell: {'; '.join(self.unseen)}")
+            lines.append(f"the data do not determine: {'; '.join(self.unseen)}")
         if bad := [misfit for misfit in self.misfits if misfit.bad]:
             worst = max(bad, key=lambda misfit: misfit.part)
             lines.append(
