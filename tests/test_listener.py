@@ -413,7 +413,7 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
         (["--rate", "0"], "--rate 0: not a number of steps a second"),
         (["--rate", "nan"], "--rate nan"),
         (["--rate", "inf"], "--rate inf"),
-        (["--overwrite"], "--overwrite does nothing without -o"),
+        (["--overwrite"], "--overwrite has no effect without -o"),
         (["--stop-time", "0.005"], "the run of 0.005 s is no whole number of steps of 0.01 s"),
         (["--on-timeout", "hold", "--lockstep"], "--on-timeout is for commands of joints that are"),
     ],

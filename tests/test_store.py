@@ -289,7 +289,7 @@ def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(native_path: Path
 
 def test_a_robots_bag_is_recovered_by_its_folder(three: Path, tmp_path: Path) -> None:
     bag = three
-    with pytest.raises(BagError, match=rf"there is no bag '.*:left'; 'twodof recover {bag}' is of"):
+    with pytest.raises(BagError, match=rf"there is no bag '.*:left'; 'twodof recover {bag}' repairs"):
         recover(f"{bag}:left")
     with pytest.raises(BagError, match=r"there is no bag '[^']*none'; make one with 'twodof run'$"):
         recover(tmp_path / "none")

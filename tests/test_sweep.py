@@ -197,7 +197,7 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kp=1:2:3", "--stop-time", "-1"], "stop time -1 s must be after"),
         (["--grid", "Kp=1:2:99999", "--grid", "Kd=1:2:99"], "runs; at most"),
         (["--grid", "limit_effort=0:1:2"], "limit_effort = 0.0: expected true or false"),
-        (["--grid", "Kp=1:2:3", "--resume"], "--resume does nothing without -o"),
+        (["--grid", "Kp=1:2:3", "--resume"], "--resume has no effect without -o"),
         (["--grid", "Kp=1:2:3", "--resume", "-o", "none"], "there is no sweep 'none' to resume"),
         (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists and is no sweep; choose another"),
         (["--grid", "Kp=1:2:3", "--workers", "0"], "0 workers; at least 1 is needed"),

@@ -28,6 +28,7 @@ EXAMPLES = {
     ],
     "layouts": ["twodof layouts my_robot.fmu -o layouts"],
     "info": ["twodof info my_robot.fmu", "twodof info my_bag", "twodof info my_sweep --json"],
+    "check": ["twodof check my_robot.fmu", "twodof check my_robot.fmu --with libcosim"],
     "linearise": ["twodof linearise TwoDof-native.fmu", "twodof linearise my_robot.fmu --at q=0.5,0.35 --at Kp=100"],
     "fit": [
         "twodof fit my_robot.urdf my_bag --free 'friction[*]' --free payload",

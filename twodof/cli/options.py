@@ -136,7 +136,7 @@ def check_company(
     """Refuse an option that has no effect without another one, or together with it; name both."""
     for option, other in (needs or {}).items():
         if _given(options, option) and not _given(options, other):
-            raise CommandLineError(f"{option} does nothing without {other}")
+            raise CommandLineError(f"{option} has no effect without {other}")
     for option, other in (excludes or {}).items():
         if _given(options, option) and _given(options, other):
             raise CommandLineError(f"{option} has no effect with {other}; leave one out")

@@ -185,13 +185,13 @@ def _received(reader: Child) -> list[Surface]:
     if isinstance(answer, str):
         raise ValueError(answer[:500])
     if not fits(answer, [(int, int, NUMBER, NUMBER, NUMBER)]) or any(min(row[:2]) < 0 for row in answer):
-        raise _AnswerError("its answer is none")
+        raise _AnswerError("its answer is invalid")
     sizes = [sum(row[i] for row in answer) for i in (0, 1)]
     if sizes[0] > 3 * MAX_TRIANGLES or sizes[1] > MAX_TRIANGLES:
         raise _AnswerError("its answer is too long")
     content = [reader.receive(size * n, MAX_MESH_WAIT) for size, n in zip(sizes, (24, 12))]
     if [len(part) for part in content] != [24 * sizes[0], 12 * sizes[1]]:
-        raise _AnswerError("its answer is none")
+        raise _AnswerError("its answer is invalid")
     vertices = np.frombuffer(content[0], "<f8").reshape(-1, 3)
     triangles = np.frombuffer(content[1], "<u4").reshape(-1, 3)
     if not np.isfinite(vertices).all():
