@@ -22,17 +22,17 @@ WIRES = (
     ("plant", "v", "controller", "v"),
     ("controller", "tau_cmd", "plant", "tau_cmd"),
 )
-"""Connections: component and group of the start, and of the end."""
+"""Connections: component and group of the start, and those of the end."""
 
 
 def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
-    """Return the files of an SSP but for its FMUs, and the files of each FMU by its path in the SSP.
+    """Return the files of an SSP except its FMUs, and the files of each FMU by its path in the SSP.
 
-    The start values of the robot are the plant's, those of the control law, its sampling and sensors the controller's,
-    and what both have is set in both.
+    The plant has the start values of the robot. The controller has those of the control law, its sampling and sensors.
+    Common start values are set in both.
 
     Raises:
-        BuildError, RobotError: naming the culprit.
+        BuildError, RobotError: the message names the culprit.
     """
     law = CONTROLS[options.control]
     of_law = {*law.inputs, *law.parameters, *SENSORS, "control_period", "control_delay"}
@@ -63,8 +63,8 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
 def _structure(title: str, tables: Mapping[str, Mapping[str, ET.Element]]) -> bytes:
     """Return the text of SystemStructure.ssd.
 
-    Connectors are those that a connection or an observer needs: importers give unconnected inputs wrong sources, or
-    refuse connectors of the system.
+    Only the connectors that a connection or an observer needs are listed, because some importers connect unconnected
+    inputs to wrong sources, or refuse connectors of the system.
     """
     root = ET.Element(f"{SSD}SystemStructureDescription", version="1.0", name=title)
     root.set("generationTool", f"twodof {__version__}")

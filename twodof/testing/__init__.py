@@ -1,4 +1,4 @@
-"""Assertions about runs for tests of users, and a pytest plugin; nothing heavy is imported before it is used."""
+"""Assertions about runs for users' tests, and a pytest plugin; slow imports happen on first use."""
 
 from .assertions import assert_equal, assert_settles, assert_within_limits
 

@@ -1,7 +1,7 @@
-"""Assertions about a run: a failure names time, joint, value and bound, and leaves a plot.
+"""Assertions about a run; a failure names time, joint, value and bound, and writes a plot.
 
-A run is a bag: its folder, or its ``Recording``. The plot is an HTML file in the report's folder, an option
-of the plugin; without the folder there is none.
+A run is a bag: its folder, or its ``Recording``. The plot is an HTML file in the report's folder, which is an option of
+the plugin; without this option there is no plot.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 REPORT: list[Path] = []
-"""The report's folder, which the plugin appends."""
-EXACT = 1e-9  # of a limit: a joint that its stop holds is within it
+"""The report's folder, if any; the plugin appends it."""
+EXACT = 1e-9  # tolerance relative to a limit, for a joint held by its stop
 
 
 def assert_settles(run: Recording | str | Path, *, within: float) -> None:
-    """Assert that a run settles: its error stays within 2 % of the first one, from some time on to the end.
+    """Assert that a run settles: from some time on, its error stays within 2 % of the initial error.
 
     Args:
-        run: the run; it has a target that it can reach.
+        run: the run, which must have a reachable target.
         within: longest settling time since the last change of the target, s.
 
     Raises:
-        AssertionError: it does not settle, settles later, or has no target.
+        AssertionError: the run does not settle, settles later, or has no target.
         BagError: the bag cannot be read.
     """
     __tracebackhide__ = True
@@ -92,7 +92,7 @@ def assert_equal(run: Recording | str | Path, reference: Recording | str | Path,
     """Assert that a run has the positions and velocities of a reference, sample by sample.
 
     Args:
-        run, reference: the runs, of equal joints and times.
+        run, reference: the runs, with equal joints and times.
         within: largest deviation of a value, in rad, m, rad/s or m/s.
 
     Raises:

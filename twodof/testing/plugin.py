@@ -1,6 +1,6 @@
 """pytest plugin: fixtures that run and check FMUs, and the folder of the assertions' plots.
 
-pytest loads it in each of its runs; the package is imported when a fixture is used.
+pytest loads it in every run; therefore it imports the package only when a fixture is used.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def run_fmu(tmp_path: Path) -> Callable[..., Any]:
-    """Return a function that runs an FMU into a bag and returns its ``Recording``; keywords as of ``twodof.run``."""
+    """Return a function that runs an FMU, writes a bag and returns its ``Recording``; keywords as in ``twodof.run``."""
 
     def run(fmu: str | Path, **options: Any) -> Any:
         import twodof
@@ -42,7 +42,7 @@ def run_fmu(tmp_path: Path) -> Callable[..., Any]:
 
 @pytest.fixture
 def check_fmu() -> Callable[..., Any]:
-    """Return a function that checks an FMU, as ``twodof.check``, and fails with the rows that failed."""
+    """Return a function that checks an FMU by ``twodof.check``, and fails with the failed rows."""
 
     def check(fmu: str | Path, **options: Any) -> Any:
         import twodof
