@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import fmpy.validation
 import numpy as np
 import pytest
+from fmpy import fmi2
 from fmpy.ssp.simulation import simulate_ssp
 from harness import in_child_process
+from scipy.integrate import solve_ivp
 from systems import component, connection, loop, ssd
 from tools import needs
 
@@ -112,6 +116,65 @@ def test_its_effort_is_that_of_the_whole_at_once(fmus: dict[str, Path]) -> None:
             fmus["joint law"], fmi_type=kind, stop_time=0.01, start_values=starts, output=["tau_cmd[1]", "tau_cmd[2]"]
         )
         np.testing.assert_allclose([*result[0]][1:], whole.tau, rtol=1e-13)
+
+
+class Model:
+    """An FMU of Model Exchange in continuous-time mode."""
+
+    def __init__(self, path: Path, folder: Path, **starts: float) -> None:
+        description = fmpy.read_model_description(path)
+        self.references = {v.name: v.valueReference for v in description.modelVariables}
+        fmpy.extract(path, folder)
+        self.fmu = fmi2.FMU2Model(
+            guid=description.guid,
+            unzipDirectory=str(folder),
+            modelIdentifier=description.modelExchange.modelIdentifier,
+            instanceName="model",
+        )
+        self.fmu.instantiate()
+        self.set(starts)
+        self.fmu.setupExperiment(startTime=0.0)
+        self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
+        self.fmu.newDiscreteStates()
+        self.fmu.enterContinuousTimeMode()
+
+    def set(self, values: Mapping[str, float]) -> None:
+        self.fmu.setReal([self.references[name] for name in values], [*values.values()])
+
+    def get(self, *names: str) -> list[float]:
+        return list(self.fmu.getReal([self.references[name] for name in names]))
+
+    def rates(self, y: np.ndarray) -> np.ndarray:
+        """Return the derivatives of q and v at a state."""
+        self.fmu.setContinuousStates((ctypes.c_double * len(y))(*y), len(y))
+        rates = (ctypes.c_double * len(y))()
+        self.fmu.getDerivatives(rates, len(y))
+        return np.array(rates)
+
+
+@pytest.mark.parametrize("law", TARGETS)
+def test_in_one_solver_a_split_loop_is_the_whole(fmus: dict[str, Path], tmp_path: Path, law: str) -> None:
+    (group, target), names = next(iter(TARGETS[law].items())), ("q[1]", "q[2]", "v[1]", "v[2]")
+    starts = {f"{group}[{i + 1}]": value for i, value in enumerate(target)}
+    whole = Model(fmus[f"{law} both"], tmp_path / "whole", **starts)
+    plant, controller = Model(fmus["plant"], tmp_path / "plant"), Model(fmus[f"{law} law"], tmp_path / "law", **starts)
+
+    def rates(_t: float, y: np.ndarray) -> np.ndarray:
+        controller.set(dict(zip(names, y)))
+        plant.set(dict(zip(("tau_cmd[1]", "tau_cmd[2]"), controller.get("tau_cmd[1]", "tau_cmd[2]"))))
+        return plant.rates(y)
+
+    start = np.array([0.5, 0.35, 0.0, 0.0])
+    ends = [
+        solve_ivp(rate, (0.0, STOP), start, rtol=1e-11, atol=1e-13).y[:, -1]
+        for rate in (rates, lambda _t, y: whole.rates(y))
+    ]
+    assert np.abs(ends[0] - start).max() > 0.1
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-9)
+    for model in (whole, plant, controller):
+        model.fmu.terminate()
+        model.fmu.freeInstance()
 
 
 def test_a_controller_is_native_and_has_a_law(tmp_path: Path) -> None:

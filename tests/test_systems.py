@@ -199,6 +199,22 @@ def test_truth_values_are_connected(plant: bytes, pd: bytes, tmp_path: Path) -> 
     np.testing.assert_array_equal(q_of(system, on=False, **settings), free)
 
 
+def test_an_input_that_changes_acts_from_that_instant(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    targets = [TARGET if k < 20 else -TARGET for k in range(N + 1)]
+    system = loop(tmp_path / "loop.ssp", plant, pd)
+    run = twodof.samples(system, step=H, stop_time=N * H, settings={**GAINS, "pd.q_des": TARGET})
+    rows = [next(run).q]
+    for target in targets[:-1]:
+        rows.append(run.send({"pd.q_des": target}).q)
+    (tmp_path / "plant.fmu").write_bytes(plant)
+    other = twodof.samples(tmp_path / "plant.fmu", step=H, stop_time=N * H)
+    sample, expected = next(other), []
+    for target in targets[:-1]:
+        expected.append(sample.q)
+        sample = other.send({"tau_cmd": 0.1 * (target - np.array(sample.q)) - 0.01 * np.array(sample.v)})
+    np.testing.assert_array_equal(rows, [*expected, sample.q])
+
+
 def test_the_bag_of_a_system_names_its_fmus_and_info_draws_it(
     plant: bytes, pd: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

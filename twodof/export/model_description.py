@@ -295,12 +295,15 @@ def _structure(
             and (whose != FRAME or (variable.index is not None and moves[variable.index]))
         }
 
+    computed = {reference for variable, reference in zip(table, references) if variable.causality == "output"}
     unknowns: dict[str, dict[str, dict[str, None]]] = {part: {} for part in UNKNOWNS_3}
     for variable, reference in zip(table, references):
         if variable.group in during and variable.causality != "input":
             kind = "Outputs" if variable.causality == "output" else "Derivatives"
             for part, rule in ((kind, during), ("InitialUnknowns", at_the_start)):
                 dependencies = known(variable, *rule[variable.group])
+                if rule is at_the_start:  # where q and v are outputs, they follow from parameters
+                    dependencies = {key: None for key in dependencies if key not in computed}
                 unknowns[part].setdefault(reference, {}).update(dependencies)
     structure = ET.SubElement(root, "ModelStructure")
     for part, name in UNKNOWNS_3.items():
