@@ -58,6 +58,19 @@ FAILURES = {
     "an unknown load": Failure("ur5", "joint", {"payload": 5.0, "Kp": 20.0}, ("load",), "the payload of 5 kg"),
     "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
     "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] = 0"),
+    "a feedforward that stays": Failure(
+        "arm", "task", {"xdd_des": (0.0, 1.0)}, ("feedforward",), "xdd_des = (0, 1) is not 0, while the target rests"
+    ),
+    "damping of the joints": Failure(
+        "arm",
+        "joint",
+        {"damping": 20.0, "q_des": (0.8, 0.65)},
+        ("load",),
+        "not know the damping of joints 'joint1', 'joint2'",
+    ),
+    "too much damping": Failure(
+        "arm", "task", {"Kp": 10.0, "Kd": 200.0}, ("time",), "stop later, or raise Kp, or lower Kd"
+    ),
     "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp[1] = 20"),
     "no damping of the orientation": Failure(
         "panda", "pose", {"Kd_rot": 0.0, "x_des": (0.3554, -0.0699, 0.5369)}, ("damping",), "Kd_rot[1] = 0 s⁻¹ damps"

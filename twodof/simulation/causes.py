@@ -18,6 +18,7 @@ KINDS = {
     "degrees": "a value in degrees where radians are meant",
     "reach": "the target is out of reach",
     "gain": "a gain of 0",
+    "feedforward": "a target that rests, with a target velocity or acceleration",
     "limit": "a joint at its position limit",
     "friction": "a joint that sticks",
     "saturation": "a motor at its effort limit",
@@ -40,6 +41,7 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
+OVERDAMPED = 5.0  # damping ratio from which on less damping is quicker
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 
 
@@ -72,7 +74,13 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     found = [*_degrees(judge), *_beyond_limits(judge)]
     ill = bool(missed) or motion == "diverging"
     if missed:
-        found += [*_reach(judge, missed), *_gains(judge, missed), *_load(judge), *_friction(judge, missed)]
+        found += [
+            *_reach(judge, missed),
+            *_gains(judge, missed),
+            *_feedforward(judge, missed),
+            *_load(judge),
+            *_friction(judge, missed),
+        ]
         found += [*_singular(judge), *_slow(judge, missed)]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *_sampled(judge)]
@@ -159,6 +167,14 @@ def _gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("gain", f"{', '.join(zero)} = 0: nothing pulls this to its target", 1.0)
 
 
+def _feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    groups = {"x": ("xd_des", "xdd_des"), "quat": ("omega_des", "alpha_des"), "q": ("v_des", "a_des")}
+    for group in (group for name in missed for group in groups[name]):
+        values = judge.given(group)
+        if values.any() and judge.changes <= MANY_CHANGES:
+            yield Cause("feedforward", f"{group} = {point_text(values)} is not 0, while the target rests", 1.0)
+
+
 def _late(judge: Judge, inside: NDArray[np.bool_]) -> float:
     """Return the share of samples at which a condition holds: of the last quarter, or of all for a moving target."""
     return float(inside[0 if judge.changes > MANY_CHANGES else -(len(inside) // 4 + 1) :].mean())
@@ -221,7 +237,11 @@ def _load(judge: Judge) -> Iterator[Cause]:
         yield Cause("load", f"the controller does not know the payload of {judge.held['payload']:g} kg", 1.0)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     damped = [f"'{name}'" for name in judge.setup.joints if name in joints and joints[name].damping > 0.0]
-    if damped:
+    usual = [joints[name].damping if name in joints else 0.0 for name in judge.setup.joints]
+    heavy = [f"'{n}'" for n, own, d in zip(judge.setup.joints, usual, judge.given("damping")) if d > 2.0 * own]
+    if heavy:
+        yield Cause("load", f"the controller does not know the damping of joints {', '.join(heavy)}", 0.4)
+    elif damped:
         yield Cause("drag", f"the controller does not know the damping of joints {', '.join(damped)} in the URDF", 0.2)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
@@ -299,4 +319,8 @@ def _slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         if steady and left < 1000.0 * judge.duration:
             late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
             text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
-            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or raise the gains", left)
+            stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
+            ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
+            heavy = max(ratios, default=0.0) > OVERDAMPED
+            remedy = f"raise {stiff}, or lower {damp}" if heavy else "raise the gains"
+            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or {remedy}", left)
