@@ -111,12 +111,12 @@ def changed(built: Path, tmp_path: Path) -> Changed:
     def change(file: str, mark: str, pattern: str) -> Path:
         files = members(built)
         sources = {Path(name).name: text for name, text in files.items() if name.startswith("sources/")}
-        text, place = sources[file].decode(), 0
+        code, place = sources[file].decode(), 0
         for part in mark.split("|"):
-            place = text.index(part, place)
-        match = re.compile(pattern).search(text, place)
+            place = code.index(part, place)
+        match = re.compile(pattern).search(code, place)
         assert match
-        sources[file] = f"{text[: match.start()]}({match[0]} + 1e-6){text[match.end() :]}".encode()
+        sources[file] = f"{code[: match.start()]}({match[0]} + 1e-6){code[match.end() :]}".encode()
         for name, text in sources.items():
             (tmp_path / name).write_bytes(text)
         command = [needs("gcc"), "-std=c99", "-shared", "-fPIC", *UNITS, "-o", "arm.so", "-lm"]
