@@ -229,3 +229,16 @@ def efforts(robot: Any, names: list[str], values: np.ndarray, states: list[np.nd
         own = frame.placement.act(pin.Inertia(given[f"mass:{link}"], com, tensor))
         model.inertias[frame.parentJoint] = model.inertias[frame.parentJoint] + own
     return np.concatenate([pin.rnea(model, model.createData(), *state) for state in states])
+
+
+def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, tmp_path):
+    """Positions that show 0.05 rad too little, efforts of 1/1.1, and a base that is tilted by 0.04 rad."""
+    q, effort = noisy(motion)
+    bag = bag_of(tmp_path / "bag", JOINTS, q - [0.0, 0.05], effort / [1.0, 1.1])
+    tilted = (9.81 * np.sin(0.04), -9.81 * np.cos(0.04), 0.0)
+    result = twodof.fit(ARM, bag, (*FREE, "offset:joint2", "gain:joint2", "gravity"), gravity=tilted)
+    found = {p.name: p for p in result.parameters}
+    truth = {**TRUTH, "offset:joint2": 0.05, "gain:joint2": 1.1, "gravity[1]": 0.0, "gravity[2]": -9.81}
+    for name, value in truth.items():
+        assert abs(found[name].after - value) <= 3.5 * found[name].deviation, (found[name], value)
+    assert found["offset:joint2"].deviation < 5e-3 and found["gain:joint2"].deviation < 0.02
