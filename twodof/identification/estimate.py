@@ -25,6 +25,8 @@ DELAY_SCALE, LARGEST_SHIFT = 0.02, 5e-4
 FEWEST = 20  # rows for the estimate of a bin's noise
 PRIOR_SHARE = 0.1
 """Share of the prior in the variance of a value, above which the data do not determine the value."""
+SHARP = 0.05
+"""Standard deviation relative to a value, below which the data determine it whatever the prior's share."""
 UNEXPLAINED, SIGNIFICANCE = 0.01, 1e-4
 """Slow residuals are reported if they exceed this fraction of the efforts, and have less than this probability."""
 
@@ -172,6 +174,8 @@ def _result(
     total = np.diag(covariance)
     by_prior = (spread[:, unseen] ** 2) @ variances[unseen]
     values = parameters.values(z[:-1])
+    sharp = np.sqrt(total[:-1]) <= SHARP * np.abs(parameters.reported(values))
+    known = sharp | (by_prior <= PRIOR_SHARE * total)[:-1]
     dynamics = parameters.dynamics(values)
     misfits = [_misfit(each, residual(each, dynamics, float(z[-1])), len(z) / len(rows)) for each in rows]
     noise = np.array([np.sqrt(np.mean(residual(each, dynamics, float(z[-1])) ** 2)) for each in rows])
@@ -179,7 +183,7 @@ def _result(
         x=z[:-1],
         values=values,
         covariance=covariance[:-1, :-1],
-        known=(by_prior <= PRIOR_SHARE * total)[:-1],
+        known=known,
         unseen=directions[:-1, unseen].T,
         delay=(float(z[-1]), float(np.sqrt(total[-1]))),
         noise=noise,
