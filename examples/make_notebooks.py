@@ -7,6 +7,7 @@ Needs the extras native, sweep, view and test.
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -235,7 +236,8 @@ NOTEBOOKS = {
 def executed(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
     """Execute a notebook in a folder, and drop large pages; raise CellExecutionError of nbclient where a cell fails."""
     resources = {"metadata": {"path": str(folder)}}
-    done = nbclient.NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=resources).execute()
+    client = nbclient.NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=resources)
+    done = client.execute(env={**os.environ, "TQDM_DISABLE": "1"})  # bars would be there on a slow machine alone
     for cell in done.cells:
         for output in cell.get("outputs", []):
             if len(output.get("data", {}).get("text/html", "")) > MOST_HTML:

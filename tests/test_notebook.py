@@ -67,7 +67,8 @@ def test_a_notebook_shows_bars_of_what_takes_long(
 ) -> None:
     """Text where ipywidgets are missing, else widgets; a script shows none."""
     shutil.copy(native_path, tmp_path / "arm.fmu")
-    begin = f"import twodof\nfrom twodof.simulation import progress\nprogress.SILENCE = {silence}"
+    begin = f"import os, twodof\nfrom twodof.simulation import progress\nprogress.SILENCE = {silence}"
+    begin += "\nos.environ.pop('TQDM_DISABLE', None);"
     run, sweep = "twodof.run('arm.fmu', stop_time=60);", "twodof.sweep('arm.fmu', grid={'Kp': [20, 60]}, stop_time=1);"
     notebook = executed(notebook_of((begin, run, sweep)), tmp_path)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]

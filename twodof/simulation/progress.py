@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,8 +19,8 @@ BAR = "{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left
 
 
 def in_notebook() -> bool:
-    """Return whether the kernel of a notebook runs this process."""
-    return "ipykernel.zmqshell" in sys.modules
+    """Return whether a notebook shows bars: its kernel runs this process, and TQDM_DISABLE is not set."""
+    return "ipykernel.zmqshell" in sys.modules and not os.environ.get("TQDM_DISABLE")
 
 
 def _bar(what: str, unit: str, **options: Any) -> Any:

@@ -68,7 +68,7 @@ def sweep(
         workers: number of local processes; None: one for each core.
         scheduler: address of a Dask scheduler whose workers are used instead. Anybody who can reach it can
             run code as you, unless Dask is configured to use TLS.
-        progress: called with the number of finished runs and of all runs; None: a notebook shows a bar.
+        progress: called with the numbers of finished and of all runs; None: a notebook's bar, if not TQDM_DISABLE.
         stop: called at least twice a second; True ends the sweep with the finished runs.
         command_line: command line for the provenance.
 
