@@ -242,3 +242,16 @@ def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, 
     for name, value in truth.items():
         assert abs(found[name].after - value) <= 3.5 * found[name].deviation, (found[name], value)
     assert found["offset:joint2"].deviation < 5e-3 and found["gain:joint2"].deviation < 0.02
+
+
+def test_efforts_that_jump_between_samples_are_named(tmp_path):
+    """The target of a continuous controller jumps twice a second; the bag has 100 samples a second."""
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", twodof.FmuOptions(native=True, settings={"armature": [0.004, 0.004]}))
+    way = np.random.default_rng(3).uniform([-2.0, 0.1], [2.0, 0.26], (20, 2))
+    places = way[:, 1:] * np.column_stack([np.cos(way[:, 0]), np.sin(way[:, 0])])
+    changes = [(0.5 * k, {"x_des[1]": x, "x_des[2]": y}) for k, (x, y) in enumerate(places.tolist())]
+    twodof.run(fmu, twodof.Bag(tmp_path / "bag", effort=True), changes=changes, stop_time=10.0)
+    result = twodof.fit(ARM, tmp_path / "bag", "armature[*]", gravity=GRAVITY)
+    assert set(result.jumps) == {*JOINTS} and all((t / 0.5) % 1.0 < 0.05 for t in result.jumps.values())
+    assert not result.explains
+    assert "the effort of joint 'joint1' jumps between samples, most at" in str(result)

@@ -51,6 +51,7 @@ class Fit:
         urdf: name of the URDF's file.
         fitted_urdf: text of the URDF with fitted numbers.
         joints: names of the robot's n joints.
+        units: "rad" or "m" of each joint.
         parameters: the free parameters.
         unseen: parameters that form each direction that the data do not determine.
         misfits: test of the model at each joint.
@@ -61,11 +62,13 @@ class Fit:
         settings: fitted values that a URDF cannot store, by variable of the FMU.
         covariance: covariance of the parameters, in their order.
         converged: False if the solution still moved when its steps ended.
+        jumps: time of the largest jump, s, by joints whose effort jumps between samples.
     """
 
     urdf: str
     fitted_urdf: bytes
     joints: tuple[str, ...]
+    units: tuple[str, ...]
     parameters: tuple[FittedParameter, ...]
     unseen: tuple[str, ...]
     misfits: tuple[Misfit, ...]
@@ -76,11 +79,12 @@ class Fit:
     settings: Mapping[str, tuple[float, ...]]
     covariance: NDArray[np.float64]
     converged: bool
+    jumps: Mapping[str, float]
 
     @property
     def explains(self) -> bool:
-        """True if the residuals at all joints are noise."""
-        return not any(misfit.bad for misfit in self.misfits)
+        """True if the residuals at all joints are noise, and the efforts do not jump between samples."""
+        return not self.jumps and not any(misfit.bad for misfit in self.misfits)
 
     @property
     def rows(self) -> list[tuple[str, str, str, str, str]]:
@@ -97,22 +101,28 @@ class Fit:
         lines = []
         if not self.converged:
             lines.append("the fit has not converged: free fewer parameters, or record more motion")
+        for joint, t in self.jumps.items():
+            lines.append(
+                f"the effort of joint '{joint}' jumps between samples, most at {t:.4g} s: its course there is"
+                " unknown, and the intervals are too narrow; record at a higher rate, or a smoother motion"
+            )
         if self.unseen:
             lines.append(f"the data do not determine: {'; '.join(self.unseen)}")
         if bad := [misfit for misfit in self.misfits if misfit.bad]:
             worst = max(bad, key=lambda misfit: misfit.part)
+            unit = "N·m" if self.units[worst.joint] == "rad" else "N"
             lines.append(
                 f"the model does not explain these data, least at joint '{self.joints[worst.joint]}': slow residuals"
-                f" of {worst.rms:.3g} N·m, {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the"
+                f" of {worst.rms:.3g} {unit}, {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the"
                 " variance of fast ones; free more parameters, or look for what the URDF does not have"
             )
         if abs(self.delay[0]) > 5.0 * self.delay[1]:
             side = "after" if self.delay[0] > 0.0 else "before"
             lines.append(f"efforts act {1e3 * abs(self.delay[0]):.3g} ms {side} their stamps")
-        for joint, before, after in zip(self.joints, self.deviation_before, self.deviation):
+        for joint, unit, before, after in zip(self.joints, self.units, self.deviation_before, self.deviation):
             lines.append(
-                f"held out: in windows of {WINDOW:g} s the simulated position of joint '{joint}' is off by"
-                f" {after:.3g} (rms), before by {before:.3g}"
+                f"held out: in windows of {WINDOW:g} s the simulated position of joint '{joint}' differs by"
+                f" {after:.3g} {unit} (rms), before the fit by {before:.3g} {unit}"
             )
         return lines
 
@@ -139,6 +149,7 @@ class Fit:
             "unseen": self.unseen,
             "explains": self.explains,
             "converged": self.converged,
+            "jumps": dict(self.jumps),
             "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
             "noise": dict(zip(self.joints, self.noise)),
             "delay": {"value": self.delay[0], "deviation": self.delay[1]},

@@ -19,7 +19,7 @@ from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
 from .prediction import deviation, predict
 from .regression import regressors
-from .stretches import Array, Stretch, stretches
+from .stretches import Array, Stretch, jumps, stretches
 
 WRONG_UNITS = 300.0
 """Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
@@ -82,7 +82,7 @@ def fit(
     fitted, held = stretches(recordings, robot)
     _check_units(parameters, fitted)
     found = estimate(parameters, fitted)
-    result = _result(path, text, read, parameters, found, held)
+    result = _result(path, text, read, parameters, found, held, jumps(recordings, robot))
     if output is not None:
         result.save(output)
     return result
@@ -117,7 +117,15 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
         )
 
 
-def _result(path: Path, text: str, urdf: Urdf, parameters: Parameters, found: Estimate, held: Sequence[Stretch]) -> Fit:
+def _result(
+    path: Path,
+    text: str,
+    urdf: Urdf,
+    parameters: Parameters,
+    found: Estimate,
+    held: Sequence[Stretch],
+    jumps: Mapping[str, float],
+) -> Fit:
     robot = parameters.robot
     before, after = parameters.dynamics(parameters.given), parameters.dynamics(found.values)
     predictions = [predict(robot, after, found.delay[0], stretch) for stretch in held]
@@ -127,6 +135,7 @@ def _result(path: Path, text: str, urdf: Urdf, parameters: Parameters, found: Es
         urdf=path.name,
         fitted_urdf=fitted_urdf(text, urdf, parameters, found.values),
         joints=robot.joints,
+        units=tuple("m" if prismatic else "rad" for prismatic in robot.prismatic),
         parameters=tuple(_parameters(parameters, found)),
         unseen=tuple(_unseen(parameters, found)),
         misfits=found.misfits,
@@ -137,6 +146,7 @@ def _result(path: Path, text: str, urdf: Urdf, parameters: Parameters, found: Es
         settings=_settings(parameters, after, found),
         covariance=found.covariance,
         converged=found.converged,
+        jumps=jumps,
     )
 
 

@@ -33,6 +33,7 @@ HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
+MOST_KURTOSIS = 30.0  # of second differences of efforts: of Gaussian noise 0, of a sine −1.5, of a few jumps over 100
 
 
 class Stretch(NamedTuple):
@@ -105,6 +106,23 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
         if not any(stretch.moving[:, i].sum() * stretch.step >= 0.5 for stretch in fitted):
             raise InputError(f"joint '{joint}' never moves in the recordings: lock it with `lock`, or record it moving")
     return fitted, held
+
+
+def jumps(recordings: Sequence[Recording], robot: Robot) -> dict[str, float]:
+    """Return the time, s, of the largest jump of the effort of each joint whose effort jumps between samples.
+
+    What the effort was between two samples is not recorded. The fit takes it as smooth, which is wrong at a jump.
+    """
+    from scipy.stats import kurtosis
+
+    found = dict[str, tuple[float, float]]()
+    for recording in recordings:
+        _, tau = _columns(recording, robot)
+        for joint, bends in zip(robot.joints, np.diff(tau, 2, axis=0).T):
+            excess = float(kurtosis(bends)) if np.ptp(bends) > 0.0 else 0.0
+            if excess > max(MOST_KURTOSIS, found.get(joint, (0.0, 0.0))[0]):
+                found[joint] = excess, float(recording.t[np.abs(bends).argmax() + 1] - recording.t[0])
+    return {joint: t for joint, (_, t) in found.items()}
 
 
 def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
