@@ -6,6 +6,7 @@ import ctypes
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import fmpy.validation
 import numpy as np
@@ -19,9 +20,10 @@ from tools import needs
 
 import twodof
 from twodof.errors import BuildError
+from twodof.fmu import System
 
-TARGETS = {"task": {"x_des": (0.25, 0.1)}, "joint": {"q_des": (0.1, 0.9)}}
-EXACT = {"rtol": 1e-10, "atol": 1e-12}
+TARGETS: dict[str, dict[str, Any]] = {"task": {"x_des": (0.25, 0.1)}, "joint": {"q_des": (0.1, 0.9)}}
+EXACT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 STOP = 1.0
 
 
@@ -30,7 +32,7 @@ def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A plant, and of each law the controller, the FMU of both, and the system of plant and controller."""
     folder, built = tmp_path_factory.mktemp("parts"), {}
 
-    def build(name: str, **options: object) -> Path:
+    def build(name: str, **options: Any) -> Path:
         return twodof.build_fmu(folder / f"{name}.fmu", twodof.FmuOptions(native=True, name=name, **options))
 
     built["plant"] = build("plant", control="effort")
@@ -50,14 +52,14 @@ def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return built
 
 
-def q_of(path: Path, step: float = 0.01, **settings: object) -> np.ndarray:
+def q_of(path: Path, step: float = 0.01, **settings: Any) -> np.ndarray:
     """Return q at every 10 ms; an array of N + 1 × 2."""
     given = {name.replace("__", "."): value for name, value in settings.items()}
     rows = [sample.q for sample in twodof.samples(path, step=step, stop_time=STOP, settings=given)]
     return np.array(rows)[:: round(0.01 / step)]
 
 
-def split_settings(law: str, **settings: object) -> dict[str, object]:
+def split_settings(law: str, **settings: object) -> dict[str, Any]:
     """Return settings of a system from those of the controller."""
     return {f"pd__{name}": value for name, value in {**TARGETS[law], **settings}.items()}
 
@@ -171,7 +173,7 @@ def test_in_one_solver_a_split_loop_is_the_whole(fmus: dict[str, Path], tmp_path
         for rate in (rates, lambda _t, y: whole.rates(y))
     ]
     assert np.abs(ends[0] - start).max() > 0.1
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-9)
     for model in (whole, plant, controller):
         model.fmu.terminate()
         model.fmu.freeInstance()
@@ -242,7 +244,9 @@ def in_libcosim(tmp_path: Path) -> None:
     from libcosimpy.CosimObserver import CosimObserver
 
     path = twodof.build_fmu(tmp_path / "arm.ssp", twodof.FmuOptions(part="split"))
-    references = {v.name: v.reference for v in twodof.load_fmu(path).components["plant"].variables.values()}
+    system = twodof.load_fmu(path)
+    assert isinstance(system, System)
+    references = {v.name: v.reference for v in system.components["plant"].variables.values()}
     with zipfile.ZipFile(path) as archive:
         archive.extractall(tmp_path / "arm")
     ends = {}

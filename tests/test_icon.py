@@ -30,7 +30,8 @@ def points_of(fmu: Path) -> list[Points]:
         picture: Any = Image.open(io.BytesIO(archive.read("model.png")))
     assert picture.format == "PNG" and picture.size == (300, 200)
     pixels = np.array(picture)
-    return [np.argwhere((pixels == (*colour, 255)).all(axis=2))[:, ::-1] * (1.0, -1.0) for colour in COLOURS]
+    places = [np.argwhere((pixels == (*colour, 255)).all(axis=2)) for colour in COLOURS]
+    return [found[:, ::-1].astype(np.float64) * np.array([1.0, -1.0]) for found in places]
 
 
 def direction(points: Points) -> float:

@@ -21,7 +21,7 @@ import twodof
 from twodof import sweep
 from twodof.cli.main import main
 from twodof.errors import SimulationError
-from twodof.fmu import Fmu, Instance, instantiate
+from twodof.fmu import Fmu, instantiate
 from twodof.simulation.verdict import METRICS
 from twodof.sweeps import runner as runner_module
 from twodof.sweeps.runner import Job, Runner, trace
@@ -137,7 +137,7 @@ def test_a_trace_has_the_numbers_of_the_samples(
     run = twodof.experiment(fmu, stop_time=0.5, settings={"max_step": max_step})
     ends = []
 
-    def whole(read: Callable[[Instance], Any]) -> Any:
+    def whole(read: Callable[[Any], Any]) -> Any:
         try:
             with instantiate(run.fmu) as instance:
                 return read(instance)
@@ -260,7 +260,7 @@ def test_a_runner_instantiates_once_and_repeats_to_the_bit(native_path: Path, mo
     made = []
     instantiate = runner_module.instantiate
 
-    def counted(fmu: Fmu) -> AbstractContextManager[Instance]:
+    def counted(fmu: Fmu) -> AbstractContextManager[Any]:
         made.append(fmu)
         return instantiate(fmu)
 

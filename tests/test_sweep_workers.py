@@ -34,7 +34,7 @@ def doors(process: int) -> dict[str, str]:
     for entry in Path(f"/proc/{process}/fd").iterdir():
         with suppress(OSError):
             own.add(re.sub(r"socket:\[(\d+)\]", r"\1", os.readlink(entry)))
-    found = {}
+    found = dict[str, str]()
     for kind in ("tcp", "tcp6", "udp", "udp6"):
         lines = Path(f"/proc/{process}/net/{kind}").read_text().splitlines()[1:]
         found |= {line.split()[9]: f"{kind} {line}" for line in lines if line.split()[9] in own}
