@@ -356,7 +356,7 @@ HOSTILE_CSVS: dict[str, tuple[Callable[[], bytes], str]] = {
     "60 MB of zero bytes": (lambda: bytes(60 * MIB), "not a CSV file|no column 'time'"),
     "60 MB of one row": (lambda: b"time,Kn\n" + b"0," * (30 * MIB), "more than 1000000 cells"),
     "60 MB of one cell": (lambda: b'time,Kn\n0,"' + b"0" * (60 * MIB), "not a CSV file"),
-    "a row of 500,000 cells": (lambda: b"time\n" + b"0," * 500_000, "row 2: 500001 cells"),
+    "a row of 500,000 cells": (lambda: b"time,Kn\n" + b"0," * 500_000, "row 2: 500001 cells"),
     "a cell of 100,000 digits": (lambda: b"time,Kn\n0," + b"1" * 10**5, "Kn = 1{50} is not finite"),
     "500,000 columns": (lambda: b"time," + b"x," * 500_000, "x is not an input"),
     "a column name of 100,000 letters": (lambda: b"time," + b"x" * 10**5, "no variable 'xxx"),
