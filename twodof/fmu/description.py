@@ -238,7 +238,8 @@ def logged(fmu: Fmu) -> Fmu:
     states = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
     kinds = {(variable.causality, variable.type) for variable in states}
     if len(states) != 2 * n or kinds != {("output", "Real")}:
-        raise FmuError(f"'{fmu.path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
+        remedy = "; it is a controller: connect it to a robot in an SSP file" if "tau_cmd[1]" in fmu.variables else ""
+        raise FmuError(f"'{fmu.path}' has no outputs q[1], q[2], … and v[1], v[2], … to log{remedy}")
     if len(fmu.joints) != n:
         raise FmuError(f"'{fmu.path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):

@@ -136,7 +136,7 @@ def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
             )
     order = [own.index(joint) for joint in robot.joints]
     if recording.tau.shape != recording.q.shape:
-        raise InputError(f"'{name}' has no efforts; record them, or name the `fmu` whose control moved the robot")
+        raise InputError(f"'{name}' has no efforts: a fit needs the effort of each JointState")
     q, tau = recording.q[:, order], recording.tau[:, order]
     for values, what in ((q, "position"), (tau, "effort")):
         if bad := np.argwhere(~np.isfinite(values)).tolist():
