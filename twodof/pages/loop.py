@@ -142,7 +142,8 @@ class Loop:
             InputError: a setting is invalid.
             ValueError: there is no such request.
         """
-        if order not in ("change", "play", "step", "reset", "record"):
+        known = order in ("change", "play", "step", "reset", "record")
+        if not known or (order == "change" and not isinstance(value, Mapping)):
             raise ValueError(order)
         with self._lock:
             if order == "change":
