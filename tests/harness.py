@@ -21,6 +21,7 @@ from ctypes import byref
 from pathlib import Path
 from textwrap import dedent, indent
 from typing import TYPE_CHECKING, Any
+from weakref import WeakMethod
 
 import fmpy
 from fmpy import fmi2
@@ -61,6 +62,18 @@ def in_child_process(test):
 
 def _call(module, name, arguments, named):
     getattr(importlib.import_module(module), name).__wrapped__(*arguments, **named)
+
+
+LOGGERS = []
+
+
+def lasting(method):
+    """Return a logger that lives as long as the process, for a weak reference to a method.
+
+    FMPy's proxy passes the messages of all FMUs to the logger that was added last, whether it lives or not.
+    """
+    LOGGERS.append(fmi2.fmi2CallbackLoggerTYPE(lambda *message: (log := method()) and log(*message)))
+    return LOGGERS[-1]
 
 
 class Worker:
@@ -229,7 +242,7 @@ class Driver:
         self.log = []
         self.status = 0
         self.callbacks = fmi2.fmi2CallbackFunctions(
-            logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
+            logger=lasting(WeakMethod(self._log)),
             allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc),
             freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free),
         )
