@@ -64,7 +64,7 @@ def _call(module, name, arguments, named):
     getattr(importlib.import_module(module), name).__wrapped__(*arguments, **named)
 
 
-LOGGERS = []
+LOGGERS = list[Any]()
 
 
 def lasting(method):
