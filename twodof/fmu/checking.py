@@ -136,20 +136,20 @@ def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
 
 def _tried(fmu: Fmu, names: Sequence[str]) -> Iterator[Row]:
     """Yield the row of each trial; after a crash, a new process does the remaining trials."""
-    todo = [*names]
-    while todo:
+    waiting = [*names]
+    while waiting:
         doing = "its start"
-        with Child(_serve, fmu.path, fmu.inside, todo, output=DEVNULL) as child:
+        with Child(_serve, fmu.path, fmu.inside, waiting, output=DEVNULL) as child:
             try:
-                while todo:
+                while waiting:
                     kind, *words = json.loads(child.receive(MAX_ROW, MAX_CALL_WAIT))
                     if kind == "row":
-                        yield Row(todo.pop(0), *words)
+                        yield Row(waiting.pop(0), *words)
                     else:
                         (doing,) = words
             except (EOFError, ValueError, TypeError) as end:  # an FMU can write what it likes
                 limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
-                yield Row(todo.pop(0), "failed", f"it ended its process at: {doing}{limit}: {end}")
+                yield Row(waiting.pop(0), "failed", f"it ended its process at: {doing}{limit}: {end}")
 
 
 def _serve(pipe: Connection, path: Path, inside: str, names: Sequence[str]) -> None:

@@ -1,8 +1,8 @@
 """Trials of a co-simulation FMU against requirements of the FMI standard.
 
-Each function has an argument Trial and returns a line with the result. Equal means bit-identical. Sources: FMI 2.0.5,
-sections 2.1 and
-4.2; FMI 3.0.2, sections 2.2 and 4.2.
+Each function has an argument Trial and returns a line with the result. Equal means bit-identical.
+
+Sources: FMI 2.0.5, sections 2.1 and 4.2; FMI 3.0.2, sections 2.2 and 4.2.
 """
 
 from __future__ import annotations
@@ -311,7 +311,9 @@ def reference_run(trial: Trial, reference: Reference, tool: str = "") -> str:
     if tool:
         _, run, versions = TOOLS[tool]
         if fmi not in versions or any(variable.dimensions for variable in trial.about.modelVariables):
-            raise UnpassedError("does not apply", f"{tool} is not tried with arrays, and of FMI with {versions}")
+            raise UnpassedError(
+                "does not apply", f"references run in {tool} for FMI {' and '.join(versions)} without arrays"
+            )
     trial.note("the run of a reference")
     rows = run(trial.fmu, reference, names)
     if reference.tolerance != reference.tolerance:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
+from xml.etree import ElementTree as ET
 
 from ..errors import FmuError, choice
 from .description import Fmu, Scalar
@@ -90,28 +91,27 @@ class Wiring:
             raise FmuError(f"'{self._path}': there is no connector '{node}'{choice(node.connector, connectors)}")
         return connectors[node.connector].kind
 
-    def _connect(self, system: Element, connection: Mapping[str, str] | object) -> None:
+    def _connect(self, system: Element, connection: ET.Element) -> None:
         """Add a connection inside a system; its start may be the sink."""
-        get = connection.get  # type: ignore[union-attr]
         ends = []
         for end in ("start", "end"):
-            inner = get(f"{end}Element")
+            inner = connection.get(f"{end}Element", "")
             name = system.name if not inner else f"{system.name}.{inner}" if system.name else inner
             if name not in self.elements:
                 raise FmuError(f"'{self._path}': a connection names '{inner:.80}', which is no element")
-            node = Node(name, get(f"{end}Connector", ""))
+            node = Node(name, connection.get(f"{end}Connector", ""))
             gives = (self._kind(node) in SOURCES) == bool(inner)
             ends.append((node, gives))
         (start, start_gives), (sink, sink_gives) = ends
         what = f"'{self._path}': the connection of '{start}' and '{sink}'"
-        affine = transformation(connection, what)  # type: ignore[arg-type]
+        affine = transformation(connection, what)
         if start_gives == sink_gives or (sink_gives and affine != IDENTITY):
             raise FmuError(f"{what} is not from an output to an input")
         if sink_gives:
             start, sink = sink, start
         if sink in self._incoming:
             raise FmuError(f"'{self._path}': two connections end at '{sink}'; leave one out")
-        self._incoming[sink] = start, get("suppressUnitConversion") not in TRUE, affine
+        self._incoming[sink] = start, connection.get("suppressUnitConversion") not in TRUE, affine
 
     def links(self) -> list[Link]:
         """Return the connections of components' variables with their first sources.
