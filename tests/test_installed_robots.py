@@ -56,6 +56,15 @@ def test_the_cache_of_robot_descriptions_is_listed(
     assert twodof.stock_robot("single").frame == "EndEffector"
 
 
+def test_a_list_without_robots_says_how_to_have_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path))
+    monkeypatch.setattr("twodof.export.stock_robots.PACKAGE", "no-such-package")
+    assert main(["build", "--list-robots"]) == 1
+    assert "there are no installed robots; pip install example-robot-data" in capsys.readouterr().err
+
+
 def test_a_robot_that_is_unknown_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["build", "--robot", "pandda"]) == 1
     assert "there is no robot 'pandda'; did you mean 'panda'?" in capsys.readouterr().err

@@ -5,6 +5,7 @@ import logging
 from functools import partial
 from pathlib import Path
 
+from ..errors import InputError
 from .completion import links
 from .info import controlled
 from .options import (
@@ -87,9 +88,12 @@ def add(build: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     if options.list_robots:
-        from ..export.stock_robots import stock_robots
+        from ..export.stock_robots import SOURCE, stock_robots
 
-        print_table(*((name, str(path.parent)) for name, path in stock_robots().items()))
+        robots = stock_robots()
+        if not robots:
+            raise InputError(f"there are no installed robots; {SOURCE}")
+        print_table(*((name, str(path.parent)) for name, path in robots.items()))
         return 0
     if options.stock and (options.urdf or options.robot):
         raise CommandLineError("--robot names an installed robot; leave out the URDF, or --robot")

@@ -16,6 +16,7 @@ from .fmu_options import FmuOptions
 from .urdf_source import last_links, read_text
 
 PACKAGE = "example-robot-data"
+SOURCE = f"pip install {PACKAGE}, or load robots with robot_descriptions"
 CACHE = "ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"
 """Environment variable of robot_descriptions, and its default."""
 HOMES = ("home", "default", "standing", "half_sitting", "neutral")
@@ -49,8 +50,7 @@ def stock_robot(name: str) -> FmuOptions:
     """
     known = stock_robots()
     if name not in known:
-        source = f"pip install {PACKAGE}, or load it with robot_descriptions"
-        raise BuildError(f"there is no robot '{name}'{choice(name, known) if known else f'; {source}'}")
+        raise BuildError(f"there is no robot '{name}'{choice(name, known) if known else f'; {SOURCE}'}")
     path = known[name]
     try:
         urdf = read_urdf(read_text(path, None))
