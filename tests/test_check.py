@@ -6,6 +6,7 @@ import json
 import subprocess
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import fmpy
 import pytest
@@ -36,6 +37,9 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 </ModelStructure>
 </fmiModelDescription>
 """
+COUNT = """<ScalarVariable name="n" valueReference="6" causality="output" variability="discrete"><Integer/>
+</ScalarVariable></ModelVariables>"""
+ALSO_INDEX = '<Unknown index="4"/>', '<Unknown index="4"/><Unknown index="6"/>'
 FAULTS = {
     "KEEPS": ("reset", "after a reset: y is"),
     "SHARES": ("two instances", "beside a second instance: y is"),
@@ -45,11 +49,14 @@ FAULTS = {
     "CRASHES": ("state", "it ended its process at: restoring the state: Aborted"),
     "NOT_FINITE": ("simulation", "y is nan after 1 steps"),
     "DISCARDS": ("simulation", "a call failed, status 2"),
+    "READS_CHANGE": ("simulation", "in a second read at one time: y is"),
+    "COUNTS": ("reset", "after a reset: n is"),
 }
 ALSO = {
     "SHARES": ("state", "serialised state"),
     "RESTORES_NOTHING": ("serialised state",),
     "CRASHES": ("serialised state",),
+    "COUNTS": ("simulation", "two instances", "state", "serialised state"),
 }
 REMARK = "it accepts the end of an initialisation that was not begun, a step of a negative size, a step from another"
 
@@ -80,7 +87,7 @@ def test_fmus_of_this_project_pass(kind: str, tmp_path: Path, fmu_path: Path, na
     assert {name for name, outcome in outcomes.items() if outcome != "passed"} == (
         {"references", "derivatives"} if kind == "python" else {"references"}
     ), str(check)
-    assert len(outcomes) == 11 and check.passed
+    assert len(outcomes) == 12 and check.passed
 
 
 def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
@@ -94,11 +101,28 @@ def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
 def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
     """A crash leaves the other rows."""
     row, text = FAULTS[fault]
-    check = twodof.check(foreign(tmp_path, fault))
+    described = (
+        DESCRIPTION.replace("</ModelVariables>", COUNT).replace(*ALSO_INDEX) if fault == "COUNTS" else DESCRIPTION
+    )
+    check = twodof.check(foreign(tmp_path, fault, described))
     assert failed(check)[row].startswith(text)
-    if fault not in ("NOT_FINITE", "DISCARDS"):
+    if fault not in ("NOT_FINITE", "DISCARDS", "READS_CHANGE"):
         assert {*failed(check)} == {row, *ALSO.get(fault, ())}
-    assert not check.passed and len(check.rows) == 11
+    assert not check.passed and len(check.rows) == 12
+
+
+def test_another_start_value_than_the_stated_one_fails(tmp_path: Path) -> None:
+    described = DESCRIPTION.replace('variability="fixed"><Real start="1"/>', 'variability="fixed"><Real start="2"/>')
+    texts = failed(twodof.check(foreign(tmp_path, description=described)))
+    assert texts == {"start values": "p is 1.0 before it is set, and its start value is 2.0"}
+
+
+@pytest.mark.parametrize("part", ["all", "controller"])
+def test_a_sampled_controller_passes(part: Any, tmp_path: Path) -> None:
+    """At a sampling instant its effort follows the target, and between two samples it does not."""
+    options = twodof.FmuOptions(native=True, part=part, settings={"control_period": 0.01})
+    check = twodof.check(twodof.build_fmu(tmp_path / "arm.fmu", options))
+    assert not failed(check), str(check)
 
 
 def test_a_call_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

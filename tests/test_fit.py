@@ -68,6 +68,7 @@ def test_the_command_writes_a_folder_whose_robot_moves_as_recorded(bag, tmp_path
     facts = json.loads((tmp_path / "fitted" / "fit.json").read_text("utf-8"))
     assert [p["name"] for p in facts["parameters"]] == list(TRUTH) and facts["explains"]
     assert all(re.search(rf"^{re.escape(name)} +0 ", printed, re.MULTILINE) for name in TRUTH), printed
+    assert "jumps" not in printed and "--gravity 0.0 -9.81 0.0" in printed
     assert "does not explain" not in printed and "--set armature=" in printed and "--set payload=" in printed
     for joint in JOINTS:
         assert facts["held_out"]["after"][joint] < 0.05 * facts["held_out"]["before"][joint]
@@ -244,6 +245,13 @@ def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, 
     for name, value in truth.items():
         assert abs(found[name].after - value) <= 3.5 * found[name].deviation, (found[name], value)
     assert found["offset:joint2"].deviation < 5e-3 and found["gain:joint2"].deviation < 0.02
+
+
+def test_a_bag_that_is_given_twice_is_refused(bag):
+    with pytest.raises(InputError, match="would count twice; leave one out"):
+        twodof.fit(ARM, [bag, bag], FREE, gravity=GRAVITY)
+    with pytest.raises(InputError, match=r"`gravity` 0\.0, nan, 0\.0 is not finite"):
+        twodof.fit(ARM, bag, FREE, gravity=(0.0, float("nan"), 0.0))
 
 
 def test_efforts_that_jump_between_samples_are_named(tmp_path):

@@ -4,9 +4,11 @@
 #include <unistd.h>
 #include "fmi2Functions.h"
 
-enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS };
+enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
+       READS_CHANGE, COUNTS };
 typedef struct { double u, x, p; int phase; } M;
 static double shared;
+static int count;
 static void start(M *m) { *m = (M){0.0, 1.0, 1.0, 0}; }
 static double y_of(M *m) { return (FAULT == SHARES ? shared : m->x) + 2.0 * m->u; }
 
@@ -37,6 +39,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
     for (size_t i = 0; i < n; i++) {
         double value[] = {0.0, m->u, m->x, m->u - m->x, FAULT == NOT_FINITE ? NAN : y_of(m), m->p};
         if (r[i] > 5) return fmi2Error;
+        if (FAULT == READS_CHANGE && r[i] == 4) m->x += 1e-3;
         v[i] = value[r[i]];
     }
     return fmi2OK;
@@ -87,7 +90,7 @@ fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean l, size_t n, const f
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
 typedef const fmi2ValueReference R[];
-NOT_THERE(fmi2GetInteger, R r, size_t n, fmi2Integer v[])
+fmi2Status fmi2GetInteger(fmi2Component c, R r, size_t n, fmi2Integer v[]) { v[0] = ++count; return fmi2OK; }
 NOT_THERE(fmi2GetBoolean, R r, size_t n, fmi2Boolean v[])
 NOT_THERE(fmi2GetString, R r, size_t n, fmi2String v[])
 NOT_THERE(fmi2SetInteger, R r, size_t n, const fmi2Integer v[])

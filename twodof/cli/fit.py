@@ -41,7 +41,11 @@ def add(fit: argparse.ArgumentParser) -> None:
     completed(frame, links)
     add_lock(fit)
     option(
-        "--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"), help="gravity, m/s2 in the root frame (0 0 -9.81)"
+        "--gravity",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="gravity, m/s2 in the root frame (the run's, else 0 0 -9.81)",
     )
     add_options(fit, "--json")
 
@@ -73,5 +77,7 @@ def call(options: argparse.Namespace) -> int:
         f" --gravity {value.replace(',', ' ')}" if name == "gravity" else f" --set {name}={value}"
         for name, value in given.items()
     )
-    print_next(f"twodof build {quote(output / 'robot.urdf')}{settings}")
+    same = "".join(f" --lock {quote(lock)}" for lock in options.locks or ())
+    same += f" --frame {quote(options.frame)}" if options.frame else ""
+    print_next(f"twodof build {quote(output / 'robot.urdf')}{same}{settings}")
     return 0

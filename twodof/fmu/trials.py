@@ -26,6 +26,7 @@ from .system_instance import instantiate_fmu
 STEPS = 20
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 """Sizes of variable steps, as multiples of the default step."""
+PART = 0.37  # part of a step, at whose end a sampled controller takes no sample
 MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
 DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
 SMOOTH, EXACT = 1e-3, 1e-7
@@ -56,6 +57,7 @@ class Trial:
         start, step: start time and step of its default experiment, s.
         variables: FMPy's descriptions of real variables, by the names of their elements.
         outputs, inputs: names of real outputs and continuous inputs.
+        others: names of integer and Boolean outputs.
     """
 
     def __init__(self, fmu: Fmu, note: Callable[[str], object]) -> None:
@@ -70,6 +72,9 @@ class Trial:
             name: described[v.reference] for name, v in fmu.variables.items() if v.type == "Real"
         }
         self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
+        self.others = [
+            n for n, v in fmu.variables.items() if v.causality == "output" and v.type in ("Integer", "Boolean")
+        ]
         inputs = [name for name, v in self.variables.items() if v.causality == "input"]
         self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
 
@@ -95,20 +100,26 @@ class Trial:
 
     def rows(self, instance: Instance, count: int = STEPS, first: int = 0) -> list[Outputs]:
         """Return the outputs after each of ``count`` steps from step ``first`` on."""
-        read, rows = instance.reader(self.outputs), []
+        rows: list[Outputs] = []
+        read = self.reader(instance)
         for k in range(first, first + count):
             self.note(f"step {k + 1}")
             instance.step(self.start + k * self.step, self.step)
-            rows.append(tuple(read()))
+            rows.append(read())
             for name, value in zip(self.outputs, rows[-1]):
                 if not isfinite(value):
                     raise SimulationError(f"{name} is {value} after {k + 1} steps")
         return rows
 
+    def reader(self, instance: Instance) -> Callable[[], Outputs]:
+        """Return a function that reads all outputs, real ones first."""
+        read = instance.reader(self.outputs)
+        return lambda: (*read(), *(instance.value(name) for name in self.others))
+
     def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
         """Raise for rows that are not equal, with the name of the first output that differs."""
         for k, pair in enumerate(zip(expected, rows)):
-            for name, x, y in zip(self.outputs, *pair):
+            for name, x, y in zip([*self.outputs, *self.others], *pair):
                 if x != y:
                     raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, {k + 1} steps on")
 
@@ -121,10 +132,27 @@ class Trial:
 
 
 def simulation(trial: Trial) -> str:
-    """Do the steps of the default experiment."""
+    """Do the steps of the default experiment, and read the outputs twice at the end."""
     with trial.instance() as instance:
-        trial.rows(instance)
+        end = trial.rows(instance)[-1:]
+        trial.compare(end, [trial.reader(instance)()], "in a second read at one time")
     return f"{STEPS} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
+
+
+def start_values(trial: Trial) -> str:
+    """Compare real inputs and parameters in initialisation mode with their start values."""
+    variables = trial.fmu.variables
+    known = [n for n, v in trial.variables.items() if v.causality in ("input", "parameter")]
+    starts = {name: start for name in known if (start := variables[name].start_value) is not None}
+    if not starts:
+        raise UnpassedError("does not apply", "it states no start values of inputs or parameters")
+    trial.note("initialisation mode")
+    with instantiate_fmu(trial.fmu) as instance:
+        instance.begin(trial.start, inf, {})
+        for (name, start), value in zip(starts.items(), instance.reader([*starts])()):
+            if value != start:
+                raise SimulationError(f"{name} is {value!r} before it is set, and its start value is {start!r}")
+    return f"{len(starts)} inputs and parameters have their start values"
 
 
 def reset(trial: Trial) -> str:
@@ -171,12 +199,12 @@ def _restored(trial: Trial, converted: Callable[[Any, Any], Any]) -> str:
     with trial.instance() as instance:
         trial.rows(instance, half)
         trial.note("saving the state")
-        saved, read = instance.slave.getFMUState(), instance.reader(trial.outputs)
-        before = tuple(read())
+        saved, read = instance.slave.getFMUState(), trial.reader(instance)
+        before = read()
         once = trial.rows(instance, half, half)
         trial.note("restoring the state")
         instance.slave.setFMUState(converted(instance.slave, saved))
-        trial.compare([before], [tuple(read())], "at the restored state")
+        trial.compare([before], [read()], "at the restored state")
         trial.compare(once, trial.rows(instance, half, half), "after the state was restored")
         instance.slave.freeFMUState(saved)
     return f"save, {half} steps, restore, {half} steps: equal"
@@ -225,7 +253,12 @@ def inputs(trial: Trial) -> str:
 
 
 def derivatives(trial: Trial) -> str:
-    """Compare directional derivatives with central differences over initial values."""
+    """Compare directional derivatives with central differences.
+
+    Inputs and states are changed before initialisation. If the initialisation takes a sample, as that of a sampled
+    controller, its differences are no derivatives; inputs are then changed between two samples, after a part of a step,
+    and differences over states are no proof.
+    """
     trial.require("providesDirectionalDerivative")
     rates = [unknown.variable for unknown in trial.about.derivatives]
     settable = [v.derivative for v in rates if v.derivative is not None and v.derivative.initial in ("exact", "approx")]
@@ -234,28 +267,48 @@ def derivatives(trial: Trial) -> str:
     widths = {name: DELTA * max(1.0, abs(start)) for name, start in starts.items() if start is not None}
     point = {name: trial.inside(name, 2.0 * width) for name, width in [*widths.items()][:MOST_KNOWNS]}
     unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
-    rough = 0
+    rough, holds, doubtful = 0, False, ""
+    varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
     with trial.instance(point) as instance:
         trial.note("directional derivatives")
         stated, read = instance.derivatives(unknowns, [*point]), instance.reader(unknowns)
 
-        def slope(name: str, width: float) -> Any:
-            values = []
-            for delta in (-width, width):
-                trial.begin_again(instance, {**point, name: point[name] + delta})
-                values.append(np.array(read()))
-            return (values[1] - values[0]) / (2.0 * width)
+        def at_start(values: Mapping[str, float]) -> None:
+            trial.begin_again(instance, {**point, **values})
 
-        for column, name in enumerate(point):
-            wide, narrow = slope(name, widths[name]), slope(name, 0.5 * widths[name])
+        def compared(name: str, change: Callable[[Mapping[str, float]], object], given: Any) -> tuple[Any, Any, Any]:
+            """Return the difference quotients, whether each is smooth, and whether it is the given derivative."""
+
+            def slope(width: float) -> Any:
+                values = []
+                for delta in (-width, width):
+                    change({name: point[name] + delta})
+                    values.append(np.array(read()))
+                return (values[1] - values[0]) / (2.0 * width)
+
+            wide, narrow = slope(widths[name]), slope(0.5 * widths[name])
             best, doubt = (4.0 * narrow - wide) / 3.0, np.abs(narrow - wide)
             scale = np.maximum(1.0, np.abs(best))
-            smooth = doubt <= SMOOTH * scale
+            return best, doubt <= SMOOTH * scale, np.abs(given - best) <= doubt + EXACT * scale
+
+        for column, name in enumerate(point):
+            best, smooth, right = compared(name, at_start, stated[:, column])
             rough += int((~smooth).sum())
-            wrong = smooth & ~(np.abs(stated[:, column] - best) <= doubt + EXACT * scale)
+            wrong = smooth & ~right
+            if wrong.any() and name in trial.inputs:
+                at_start({})
+                instance.step(trial.start, trial.step * (PART if varies else 1.0))
+                inside = compared(name, instance.set, instance.derivatives(unknowns, [name])[:, 0])[2]
+                holds |= bool((wrong & inside).any())
+                wrong &= ~inside
             if wrong.any():
                 k = int(wrong.argmax())
-                raise SimulationError(f"∂{unknowns[k]}/∂{name} is {best[k]:.9g}, and it gives {stated[k, column]:.9g}")
+                text = f"∂{unknowns[k]}/∂{name} is {best[k]:.9g}, and it gives {stated[k, column]:.9g}"
+                if name in trial.inputs or not holds:
+                    raise SimulationError(text)
+                doubtful = doubtful or text
+    if doubtful:
+        raise UnpassedError("remark", f"{doubtful}; the first may contain a sample that the initialisation takes")
     if stated.size == rough:
         raise UnpassedError("does not apply", "there is no output that is smooth in an input or state at the start")
     left = f"; {rough} more at a jump were not compared" if rough else ""
@@ -325,6 +378,7 @@ TRIALS: dict[str, Callable[[Trial], str]] = {
     trial.__name__.replace("_", " "): trial
     for trial in (
         simulation,
+        start_values,
         reset,
         two_instances,
         state,

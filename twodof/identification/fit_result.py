@@ -59,7 +59,7 @@ class Fit:
         delay: time from a recorded effort to its action, s, and its standard deviation.
         deviation_before, deviation: root mean square of simulated minus measured positions of each joint in the
             held-out stretches, rad or m, before and after the fit; empty if no stretch is long enough.
-        settings: fitted values that a URDF cannot store, by variable of the FMU.
+        settings: fitted values that a URDF cannot store, and its gravity, by variable of the FMU.
         covariance: covariance of the parameters, in their order.
         converged: False if the solution still moved when its steps ended.
         jumps: time of the largest jump, s, by joints whose effort jumps between samples.
@@ -106,6 +106,9 @@ class Fit:
                 f"the effort of joint '{joint}' jumps between samples, most at {t:.4g} s: its course there is"
                 " unknown, and the intervals are too narrow; record at a higher rate, or a smoother motion"
             )
+        groups = {parameter.name.partition(":")[0] for parameter in self.parameters}
+        if "gain" in groups and "mass" not in groups:
+            lines.append("gains are right only if the URDF's masses are: free 'mass:*' too, or weigh the robot")
         if self.unseen:
             lines.append(f"the data do not determine: {'; '.join(self.unseen)}")
         if bad := [misfit for misfit in self.misfits if misfit.bad]:

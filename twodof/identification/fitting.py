@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,8 @@ def fit(
     """
     if output is not None:
         check_folder(output)
+    if gravity is not None and not np.isfinite(gravity).all():
+        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
     path = Path(urdf)
     text = read_text(path, None)
     try:
@@ -75,6 +78,9 @@ def fit(
     recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
     if not recordings:
         raise InputError("a fit needs a bag")
+    for a, b in combinations(recordings, 2):
+        if np.array_equal(a.t, b.t) and np.array_equal(a.q, b.q):
+            raise InputError(f"'{b.path}' has the motion of '{a.path}', which would count twice; leave one out")
     patterns = [free] if isinstance(free, str) else free
     parameters = Parameters(there, robot, patterns, gravity or _recorded_gravity(recordings))
     if not parameters.free:
@@ -175,7 +181,7 @@ def _unseen(parameters: Parameters, found: Estimate) -> list[str]:
 
 
 def _settings(parameters: Parameters, after: Dynamics, found: Estimate) -> dict[str, tuple[float, ...]]:
-    """Return the fitted values that a URDF cannot store, as settings of a build."""
+    """Return the fitted values that a URDF cannot store, and its gravity, as settings of a build."""
     groups = {free.group for free in parameters.free}
     settings: dict[str, Array] = {}
     if "armature" in groups:
@@ -184,6 +190,6 @@ def _settings(parameters: Parameters, after: Dynamics, found: Estimate) -> dict[
         settings["payload"] = found.values.payload
     if "payload_com" in groups:
         settings["payload_com"] = found.values.payload_com
-    if "gravity" in groups:
+    if "gravity" in groups or after.gravity.tolist() != [*GRAVITY]:
         settings["gravity"] = after.gravity
     return {name: tuple(float(f"{value:.9g}") for value in values) for name, values in settings.items()}

@@ -33,7 +33,10 @@ HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
-MOST_KURTOSIS = 30.0  # of second differences of efforts: of Gaussian noise 0, of a sine −1.5, of a few jumps over 100
+MOST_KURTOSIS, MOST_BEND = 30.0, 5.0
+"""Second differences of efforts that show jumps: kurtosis (of noise 0, of a few jumps over 100), and largest one in
+standard deviations of the effort. A reversal of friction alone gives at most 2.
+"""
 
 
 class Stretch(NamedTuple):
@@ -117,11 +120,13 @@ def jumps(recordings: Sequence[Recording], robot: Robot) -> dict[str, float]:
 
     found = dict[str, tuple[float, float]]()
     for recording in recordings:
-        _, tau = _columns(recording, robot)
-        for joint, bends in zip(robot.joints, np.diff(tau, 2, axis=0).T):
-            excess = float(kurtosis(bends)) if np.ptp(bends) > 0.0 else 0.0
-            if excess > max(MOST_KURTOSIS, found.get(joint, (0.0, 0.0))[0]):
-                found[joint] = excess, float(recording.t[np.abs(bends).argmax() + 1] - recording.t[0])
+        t = recording.t - recording.t[0]
+        used = slice(*np.searchsorted(t, (EDGE, t[-1] - EDGE)))
+        tau = _columns(recording, robot)[1][used]
+        for joint, effort, bends in zip(robot.joints, tau.T, np.diff(tau, 2, axis=0).T):
+            largest = float(np.abs(bends).max(initial=0.0) / max(effort.std(), 1e-300))
+            if largest > max(MOST_BEND, found.get(joint, (0.0, 0.0))[0]) and kurtosis(bends) > MOST_KURTOSIS:
+                found[joint] = largest, float(t[used][np.abs(bends).argmax() + 1])
     return {joint: t for joint, (_, t) in found.items()}
 
 
