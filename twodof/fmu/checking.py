@@ -21,7 +21,8 @@ from .importers import require
 from .reference_runs import Reference, references_of
 from .ssp_file import STRUCTURE, read_ssp
 from .system import load_system
-from .trials import TRIALS, Trial, UnpassedError, reference_run
+from .trial import Trial, UnpassedError
+from .trials import TRIALS, reference_run
 
 REFERENCE, WITH = "reference ", " with "
 

@@ -7,128 +7,23 @@ Sources: FMI 2.0.5, sections 2.1 and 4.2; FMI 3.0.2, sections 2.2 and 4.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from math import inf, isfinite
 from typing import Any
 
-import numpy as np
-from fmpy.model_description import ModelVariable
-
 from ..errors import SimulationError
-from .description import Fmu
+from .derivative_trial import derivatives
 from .importers import TOOLS, Run, in_this_master
 from .instance import Instance
 from .reference_runs import Reference
 from .system_instance import instantiate_fmu
+from .trial import DELTA, STEPS, Trial, UnpassedError
 
-STEPS = 20
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 """Sizes of variable steps, as multiples of the default step."""
-PART = 0.37  # part of a step, at whose end a sampled controller takes no sample
-MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
-DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
-SMOOTH, EXACT = 1e-3, 1e-7
-"""Largest difference between the difference quotients of two widths with which a derivative is compared, and tolerance
-of the comparison in addition to it, both relative to the derivative's magnitude or to 1.
-"""
 UNKNOWN = 2**31 - 9  # a value reference that no variable has
-Outputs = tuple[float, ...]
 Calls = dict[str, tuple[str, Callable[[Instance], object]]]
-
-
-class UnpassedError(Exception):
-    """A trial ends with the outcome "remark" or "does not apply"."""
-
-    def __init__(self, outcome: str, text: str) -> None:
-        super().__init__(text)
-        self.outcome = outcome
-
-
-class Trial:
-    """An FMU with its default experiment.
-
-    Args:
-        fmu: the FMU.
-        note: called with the name of the next call, which the report of a crash contains.
-
-    Attributes:
-        start, step: start time and step of its default experiment, s.
-        variables: FMPy's descriptions of real variables, by the names of their elements.
-        outputs, inputs: names of real outputs and continuous inputs.
-        others: names of integer and Boolean outputs.
-    """
-
-    def __init__(self, fmu: Fmu, note: Callable[[str], object]) -> None:
-        self.fmu, self.note, self.about = fmu, note, fmu.description
-        start, stop, step = (
-            getattr(self.about.defaultExperiment, name, None) for name in ("startTime", "stopTime", "stepSize")
-        )
-        self.start = float(start or 0.0)
-        self.step = float(step or (float(stop) - self.start if stop else 5.0) / 500)
-        described = {v.valueReference: v for v in self.about.modelVariables if v.type in ("Real", "Float64")}
-        self.variables: dict[str, ModelVariable] = {
-            name: described[v.reference] for name, v in fmu.variables.items() if v.type == "Real"
-        }
-        self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
-        self.others = [
-            n for n, v in fmu.variables.items() if v.causality == "output" and v.type in ("Integer", "Boolean")
-        ]
-        inputs = [name for name, v in self.variables.items() if v.causality == "input"]
-        self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
-
-    def require(self, *claims: str) -> None:
-        """End a trial of a feature that the description does not claim."""
-        for claim in claims:
-            if not getattr(self.about.coSimulation, claim):
-                raise UnpassedError("does not apply", f"it does not state {claim}")
-
-    @contextmanager
-    def instance(self, values: Mapping[str, float] | None = None) -> Iterator[Instance]:
-        """Instantiate and initialise the FMU."""
-        self.note("instantiation and initialisation")
-        with instantiate_fmu(self.fmu) as instance:
-            instance.initialise(self.start, inf, values or {})
-            yield instance
-
-    def begin_again(self, instance: Instance, values: Mapping[str, float] | None = None) -> None:
-        """Reset and initialise an instance."""
-        self.note("reset")
-        instance.reset()
-        instance.initialise(self.start, inf, values or {})
-
-    def rows(self, instance: Instance, count: int = STEPS, first: int = 0) -> list[Outputs]:
-        """Return the outputs after each of ``count`` steps from step ``first`` on."""
-        rows: list[Outputs] = []
-        read = self.reader(instance)
-        for k in range(first, first + count):
-            self.note(f"step {k + 1}")
-            instance.step(self.start + k * self.step, self.step)
-            rows.append(read())
-            for name, value in zip(self.outputs, rows[-1]):
-                if not isfinite(value):
-                    raise SimulationError(f"{name} is {value} after {k + 1} steps")
-        return rows
-
-    def reader(self, instance: Instance) -> Callable[[], Outputs]:
-        """Return a function that reads all outputs, real ones first."""
-        read = instance.reader(self.outputs)
-        return lambda: (*read(), *(instance.value(name) for name in self.others))
-
-    def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
-        """Raise for rows that are not equal, with the name of the first output that differs."""
-        for k, pair in enumerate(zip(expected, rows)):
-            for name, x, y in zip([*self.outputs, *self.others], *pair):
-                if x != y:
-                    raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, {k + 1} steps on")
-
-    def inside(self, name: str, change: float) -> float:
-        """Return a variable's start value plus a change, with this distance from its bounds if the range allows it."""
-        variable, start = self.variables[name], self.fmu.variables[name].start_value or 0.0
-        low, high = (end if text is None else float(text) for text, end in ((variable.min, -inf), (variable.max, inf)))
-        margin = change if high - low > 2.0 * change else 0.0
-        return min(max(start + change, low + margin), high - margin)
 
 
 def simulation(trial: Trial) -> str:
@@ -250,69 +145,6 @@ def inputs(trial: Trial) -> str:
             instance.set(changed)
             trial.rows(instance, 1, 1)
     return f"{len(trial.inputs)} inputs; outputs depend on no others than they state"
-
-
-def derivatives(trial: Trial) -> str:
-    """Compare directional derivatives with central differences.
-
-    Inputs and states are changed before initialisation. If the initialisation takes a sample, as that of a sampled
-    controller, its differences are no derivatives; inputs are then changed between two samples, after a part of a step,
-    and differences over states are no proof.
-    """
-    trial.require("providesDirectionalDerivative")
-    rates = [unknown.variable for unknown in trial.about.derivatives]
-    settable = [v.derivative for v in rates if v.derivative is not None and v.derivative.initial in ("exact", "approx")]
-    names = [*trial.inputs, *(name for name, v in trial.variables.items() if v in settable)]
-    starts = {name: trial.fmu.variables[name].start_value for name in names}
-    widths = {name: DELTA * max(1.0, abs(start)) for name, start in starts.items() if start is not None}
-    point = {name: trial.inside(name, 2.0 * width) for name, width in [*widths.items()][:MOST_KNOWNS]}
-    unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
-    rough, holds, doubtful = 0, False, ""
-    varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
-    with trial.instance(point) as instance:
-        trial.note("directional derivatives")
-        stated, read = instance.derivatives(unknowns, [*point]), instance.reader(unknowns)
-
-        def at_start(values: Mapping[str, float]) -> None:
-            trial.begin_again(instance, {**point, **values})
-
-        def compared(name: str, change: Callable[[Mapping[str, float]], object], given: Any) -> tuple[Any, Any, Any]:
-            """Return the difference quotients, whether each is smooth, and whether it is the given derivative."""
-
-            def slope(width: float) -> Any:
-                values = []
-                for delta in (-width, width):
-                    change({name: point[name] + delta})
-                    values.append(np.array(read()))
-                return (values[1] - values[0]) / (2.0 * width)
-
-            wide, narrow = slope(widths[name]), slope(0.5 * widths[name])
-            best, doubt = (4.0 * narrow - wide) / 3.0, np.abs(narrow - wide)
-            scale = np.maximum(1.0, np.abs(best))
-            return best, doubt <= SMOOTH * scale, np.abs(given - best) <= doubt + EXACT * scale
-
-        for column, name in enumerate(point):
-            best, smooth, right = compared(name, at_start, stated[:, column])
-            rough += int((~smooth).sum())
-            wrong = smooth & ~right
-            if wrong.any() and name in trial.inputs:
-                at_start({})
-                instance.step(trial.start, trial.step * (PART if varies else 1.0))
-                inside = compared(name, instance.set, instance.derivatives(unknowns, [name])[:, 0])[2]
-                holds |= bool((wrong & inside).any())
-                wrong &= ~inside
-            if wrong.any():
-                k = int(wrong.argmax())
-                text = f"∂{unknowns[k]}/∂{name} is {best[k]:.9g}, and it gives {stated[k, column]:.9g}"
-                if name in trial.inputs or not holds:
-                    raise SimulationError(text)
-                doubtful = doubtful or text
-    if doubtful:
-        raise UnpassedError("remark", f"{doubtful}; the first may contain a sample that the initialisation takes")
-    if stated.size == rough:
-        raise UnpassedError("does not apply", "there is no output that is smooth in an input or state at the start")
-    left = f"; {rough} more at a jump were not compared" if rough else ""
-    return f"{stated.size - rough} agree with central differences{left}"
 
 
 def call_order(trial: Trial) -> str:

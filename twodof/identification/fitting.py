@@ -75,12 +75,7 @@ def fit(
         robot = load_robot(locked, end, "xyz")
     except RobotError as error:
         raise InputError(f"{path.name}: {error}") from error
-    recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
-    if not recordings:
-        raise InputError("a fit needs a bag")
-    for a, b in combinations(recordings, 2):
-        if np.array_equal(a.t, b.t) and np.array_equal(a.q, b.q):
-            raise InputError(f"'{b.path}' has the motion of '{a.path}', which would count twice; leave one out")
+    recordings = _recordings(bags)
     patterns = [free] if isinstance(free, str) else free
     parameters = Parameters(there, robot, patterns, gravity or _recorded_gravity(recordings))
     if not parameters.free:
@@ -92,6 +87,17 @@ def fit(
     if output is not None:
         result.save(output)
     return result
+
+
+def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
+    """Return the recordings of bags; raise InputError if there are none, or one counts twice."""
+    recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
+    if not recordings:
+        raise InputError("a fit needs a bag")
+    for a, b in combinations(recordings, 2):
+        if np.array_equal(a.t, b.t) and np.array_equal(a.q, b.q):
+            raise InputError(f"'{b.path}' has the motion of '{a.path}', which would count twice; leave one out")
+    return recordings
 
 
 def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:

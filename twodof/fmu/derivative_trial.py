@@ -1,0 +1,134 @@
+"""Compare an FMU's directional derivatives with central differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SimulationError
+from .instance import Instance
+from .trial import DELTA, Trial, UnpassedError
+
+PART = 0.37  # part of a step, at whose end a sampled controller takes no sample
+MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
+SMOOTH, EXACT = 1e-3, 1e-7
+"""Largest difference between the difference quotients of two widths with which a derivative is compared, and tolerance
+of the comparison in addition to it, both relative to the derivative's magnitude or to 1.
+"""
+Array = NDArray[np.float64]
+
+
+class Slopes(NamedTuple):
+    """Difference quotients of the unknowns over one variable.
+
+    Attributes:
+        best: extrapolated from those of two widths.
+        doubt: difference of the two.
+    """
+
+    best: Array
+    doubt: Array
+
+    @property
+    def scale(self) -> Array:
+        """Magnitudes that tolerances are relative to."""
+        return np.maximum(1.0, np.abs(self.best))
+
+    @property
+    def smooth(self) -> NDArray[np.bool_]:
+        """True where the two quotients agree; elsewhere there is a jump."""
+        return self.doubt <= SMOOTH * self.scale
+
+    def differ(self, given: Array) -> NDArray[np.bool_]:
+        """Return where derivatives are not those of the differences."""
+        return self.smooth & ~(np.abs(given - self.best) <= self.doubt + EXACT * self.scale)
+
+
+class Point:
+    """The values of inputs and states at which derivatives are compared.
+
+    Args:
+        trial: the FMU.
+
+    Attributes:
+        values: the point, by the names of the knowns.
+        unknowns: names of outputs and derivatives.
+    """
+
+    def __init__(self, trial: Trial) -> None:
+        self._trial = trial
+        rates = [unknown.variable for unknown in trial.about.derivatives]
+        states = [v.derivative for v in rates if v.derivative is not None]
+        settable = [state for state in states if state.initial in ("exact", "approx")]
+        names = [*trial.inputs, *(name for name, v in trial.variables.items() if v in settable)]
+        starts = {name: trial.fmu.variables[name].start_value for name in names}
+        widths = {name: DELTA * max(1.0, abs(start)) for name, start in starts.items() if start is not None}
+        self._widths = dict([*widths.items()][:MOST_KNOWNS])
+        self.values = {name: trial.inside(name, 2.0 * width) for name, width in self._widths.items()}
+        self.unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
+
+    def slopes(self, instance: Instance, name: str, change: Callable[[Mapping[str, float]], object]) -> Slopes:
+        """Return the slopes over a variable, which is changed by a function."""
+        read = instance.reader(self.unknowns)
+
+        def slope(width: float) -> Array:
+            values = []
+            for delta in (-width, width):
+                change({name: self.values[name] + delta})
+                values.append(np.array(read()))
+            return np.asarray((values[1] - values[0]) / (2.0 * width))
+
+        wide, narrow = slope(self._widths[name]), slope(0.5 * self._widths[name])
+        return Slopes((4.0 * narrow - wide) / 3.0, np.abs(narrow - wide))
+
+    def between_samples(self, instance: Instance, name: str) -> NDArray[np.bool_]:
+        """Return where derivatives over an input are not those of the differences after a part of a step."""
+        trial = self._trial
+        trial.begin_again(instance, self.values)
+        varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
+        instance.step(trial.start, trial.step * (PART if varies else 1.0))
+        given = instance.derivatives(self.unknowns, [name])[:, 0]
+        slopes = self.slopes(instance, name, instance.set)
+        return ~slopes.smooth | slopes.differ(given)
+
+
+def derivatives(trial: Trial) -> str:
+    """Compare directional derivatives with central differences.
+
+    Inputs and states are changed before initialisation. If the initialisation takes a sample, as that of a sampled
+    controller, its differences are no derivatives; inputs are then changed between two samples, after a part of a step,
+    and differences over states are no proof.
+    """
+    trial.require("providesDirectionalDerivative")
+    point = Point(trial)
+    jumps, samples, doubtful = 0, False, ""
+    with trial.instance(point.values) as instance:
+        trial.note("directional derivatives")
+        stated = instance.derivatives(point.unknowns, [*point.values])
+
+        def at_start(values: Mapping[str, float]) -> None:
+            trial.begin_again(instance, {**point.values, **values})
+
+        for given, name in zip(stated.T, point.values):
+            slopes = point.slopes(instance, name, at_start)
+            jumps += int((~slopes.smooth).sum())
+            wrong = slopes.differ(given)
+            if wrong.any() and name in trial.inputs:
+                still = point.between_samples(instance, name)
+                samples |= bool((wrong & ~still).any())
+                wrong &= still
+            if wrong.any():
+                k = int(wrong.argmax())
+                text = f"∂{point.unknowns[k]}/∂{name} is {slopes.best[k]:.9g}, and it gives {given[k]:.9g}"
+                if name in trial.inputs or not samples:
+                    raise SimulationError(text)
+                doubtful = doubtful or text
+    if doubtful:
+        raise UnpassedError("remark", f"{doubtful}; the first may contain a sample that the initialisation takes")
+    if stated.size == jumps:
+        raise UnpassedError("does not apply", "there is no output that is smooth in an input or state at the start")
+    left = f"; {jumps} more at a jump were not compared" if jumps else ""
+    return f"{stated.size - jumps} agree with central differences{left}"

@@ -1,0 +1,111 @@
+"""An FMU that is tried: its default experiment, its runs, and comparisons of their outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from math import inf, isfinite
+
+from fmpy.model_description import ModelVariable
+
+from ..errors import SimulationError
+from .description import Fmu
+from .instance import Instance
+from .system_instance import instantiate_fmu
+
+STEPS = 20
+DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
+Outputs = tuple[float, ...]
+
+
+class UnpassedError(Exception):
+    """A trial ends with the outcome "remark" or "does not apply"."""
+
+    def __init__(self, outcome: str, text: str) -> None:
+        super().__init__(text)
+        self.outcome = outcome
+
+
+class Trial:
+    """An FMU with its default experiment.
+
+    Args:
+        fmu: the FMU.
+        note: called with the name of the next call, which the report of a crash contains.
+
+    Attributes:
+        start, step: start time and step of its default experiment, s.
+        variables: FMPy's descriptions of real variables, by the names of their elements.
+        outputs, inputs: names of real outputs and continuous inputs.
+        others: names of integer and Boolean outputs.
+    """
+
+    def __init__(self, fmu: Fmu, note: Callable[[str], object]) -> None:
+        self.fmu, self.note, self.about = fmu, note, fmu.description
+        start, stop, step = (
+            getattr(self.about.defaultExperiment, name, None) for name in ("startTime", "stopTime", "stepSize")
+        )
+        self.start = float(start or 0.0)
+        self.step = float(step or (float(stop) - self.start if stop else 5.0) / 500)
+        described = {v.valueReference: v for v in self.about.modelVariables if v.type in ("Real", "Float64")}
+        self.variables: dict[str, ModelVariable] = {
+            name: described[v.reference] for name, v in fmu.variables.items() if v.type == "Real"
+        }
+        self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
+        self.others = [
+            n for n, v in fmu.variables.items() if v.causality == "output" and v.type in ("Integer", "Boolean")
+        ]
+        inputs = [name for name, v in self.variables.items() if v.causality == "input"]
+        self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
+
+    def require(self, *claims: str) -> None:
+        """End a trial of a feature that the description does not claim."""
+        for claim in claims:
+            if not getattr(self.about.coSimulation, claim):
+                raise UnpassedError("does not apply", f"it does not state {claim}")
+
+    @contextmanager
+    def instance(self, values: Mapping[str, float] | None = None) -> Iterator[Instance]:
+        """Instantiate and initialise the FMU."""
+        self.note("instantiation and initialisation")
+        with instantiate_fmu(self.fmu) as instance:
+            instance.initialise(self.start, inf, values or {})
+            yield instance
+
+    def begin_again(self, instance: Instance, values: Mapping[str, float] | None = None) -> None:
+        """Reset and initialise an instance."""
+        self.note("reset")
+        instance.reset()
+        instance.initialise(self.start, inf, values or {})
+
+    def rows(self, instance: Instance, count: int = STEPS, first: int = 0) -> list[Outputs]:
+        """Return the outputs after each of ``count`` steps from step ``first`` on."""
+        rows: list[Outputs] = []
+        read = self.reader(instance)
+        for k in range(first, first + count):
+            self.note(f"step {k + 1}")
+            instance.step(self.start + k * self.step, self.step)
+            rows.append(read())
+            for name, value in zip(self.outputs, rows[-1]):
+                if not isfinite(value):
+                    raise SimulationError(f"{name} is {value} after {k + 1} steps")
+        return rows
+
+    def reader(self, instance: Instance) -> Callable[[], Outputs]:
+        """Return a function that reads all outputs, real ones first."""
+        read = instance.reader(self.outputs)
+        return lambda: (*read(), *(instance.value(name) for name in self.others))
+
+    def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
+        """Raise for rows that are not equal, with the name of the first output that differs."""
+        for k, pair in enumerate(zip(expected, rows)):
+            for name, x, y in zip([*self.outputs, *self.others], *pair):
+                if x != y:
+                    raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, {k + 1} steps on")
+
+    def inside(self, name: str, change: float) -> float:
+        """Return a variable's start value plus a change, with this distance from its bounds if the range allows it."""
+        variable, start = self.variables[name], self.fmu.variables[name].start_value or 0.0
+        low, high = (end if text is None else float(text) for text, end in ((variable.min, -inf), (variable.max, inf)))
+        margin = change if high - low > 2.0 * change else 0.0
+        return min(max(start + change, low + margin), high - margin)
