@@ -168,12 +168,17 @@ def test_the_view_is_brought_back(page: Page) -> None:
     scrub(page, 1.0)
     page.locator("#arm-scene").focus()
     page.keyboard.press("Home")
-    before = picture(page)
+    before = picture(page).astype(int)
+
+    def change(shot: np.ndarray) -> float:
+        return float(np.abs(shot - before).mean())
+
     page.locator("#arm-scene").hover()
     page.mouse.wheel(0, -400)
-    until(page, lambda shot: (shot != before).any(), picture)
+    zoomed = change(until(page, lambda shot: change(shot) > 1.0, picture))
     page.keyboard.press("Home")
-    until(page, lambda shot: (shot == before).all(), picture)
+    # A page whose frames have become slow smooths edges no more: the view is the same, some pixels are not.
+    until(page, lambda shot: change(shot) < 0.1 * zoomed, picture)
 
 
 def test_speed_is_that_of_the_wall_clock(page: Page, speed: float = 0.25) -> None:
