@@ -115,15 +115,22 @@ class Node:
         self.say(f"{topic} {frame or '-'} {' '.join(map(repr, xyz))}")
 
     def leads(self, topic: str, *xyz: float) -> None:
-        """Send a point until /target follows it: a reader may discover a writer seconds later than
+        """Send a point until /target follows it."""
+        line = f"{topic} world {' '.join(map(repr, xyz))}"
+        self.insists(line, lambda: self.messages("/target")[-1:] and self.messages("/target")[-1][1] == list(xyz))
+
+    def insists(self, line: str, condition: Callable[[], Any]) -> None:
+        """Send a message until the condition holds: a reader may discover a writer seconds later than
         the writer discovers the reader, and what comes before is lost."""
 
-        def follows() -> bool:
-            self.point(topic, "world", *xyz)
-            self.hears("/target")
-            return self.messages("/target")[-1][1] == list(xyz)
+        def holds() -> bool:
+            self.say(line)
+            end = time.monotonic() + 1.0
+            while not condition() and time.monotonic() < end:
+                time.sleep(0.02)
+            return bool(condition())
 
-        self.until(follows)
+        self.until(holds)
 
     def say(self, line: str) -> None:
         """Send a message to somebody who listens on its topic."""

@@ -290,7 +290,9 @@ def test_a_flood_of_commands_holds_nothing_up(jointed: Path, tmp_path: Path, num
     node = listen("/joint_states", "/joint_commands=command")
     with published(number, jointed, "-o", str(bag)) as process:
         node.hears()
-        node.say("/joint_commands 5000 0 joint2,joint1 0.1,0.2 - -")
+        command = "0 joint2,joint1 0.1,0.2 - -"
+        node.insists(f"/joint_commands 1 {command}", lambda: node.messages("/joint_states")[-1][2][0] > 0.1)
+        node.say(f"/joint_commands 5000 {command}")
         node.say("/joint_commands 1 0 joint2,joint1 0.3,0.4 - -")
         node.until(lambda: np.allclose(node.messages("/joint_states")[-1][2], (0.4, 0.3), atol=1e-2))
         process.send_signal(signal.SIGINT)
@@ -330,7 +332,8 @@ def test_several_robots_are_in_step_and_apart(
     bag = tmp_path / "bag"
     with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "6") as process:  # type: ignore[arg-type]
         node.hears("/Bare2/joint_states", more=50)
-        node.say("/right/joint_commands 1 0 joint1,joint2 0.9,-0.6 0,0 -")
+        command = "/right/joint_commands 1 0 joint1,joint2 0.9,-0.6 0,0 -"
+        node.insists(command, lambda: node.messages("/right/joint_states")[-1][2][0] > 0.5)
         _, err = ended(process)
     assert err.startswith("WARNING: no command for 0.5 s: the last one is held")
     assert err.count("WARNING") == 1
@@ -381,10 +384,12 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
 
     with published(number, native_path, "--clock", "--stamp-start", "0") as process:
         node.hears("/clock")
-        node.say("/pause true")
+        node.insists("/pause true", stands)
+        paused = clock()[-1]
+        node.insists("/step 3", lambda: clock()[-1] > paused)
         node.until(stands)
         paused = clock()[-1]
-        node.say("/step 3")
+        node.say("/step 3")  # once, to one who is known to hear it
         node.until(lambda: clock()[-1] > paused)
         node.until(stands)
         assert clock()[-1] == paused + 3 * SECOND // 100
