@@ -7,7 +7,7 @@ declare class DecompressionStream implements GenericTransformStream {
 
 /** Of plotly, what plots call. */
 declare const Plotly: {
-  newPlot(place: HTMLElement, data: object[], layout: object, config: object): Promise<unknown>;
-  react(place: HTMLElement, data: object[], layout: object, config: object): Promise<unknown>;
-  restyle(place: HTMLElement, changed: object): Promise<unknown>;
+  newPlot(element: HTMLElement, data: object[], layout: object, config: object): Promise<unknown>;
+  react(element: HTMLElement, data: object[], layout: object, config: object): Promise<unknown>;
+  restyle(element: HTMLElement, changed: object): Promise<unknown>;
 };

@@ -22,7 +22,7 @@ import twodof
 from twodof.bag.provenance import Provenance
 from twodof.plots.interactive import over_time
 from twodof.plots.runs import plot
-from twodof.plots.strokes import looks
+from twodof.plots.strokes import line_styles
 from twodof.plots.track import read_tracks
 from twodof.plots.words import labels, outcome
 
@@ -231,7 +231,7 @@ def test_a_bag_may_have_the_name_of_a_limit(default: Recording) -> None:
     run = replace(twodof.read_bag(default.bag), path=Path("limit"))
     figure = plot(run)
     curves = [line for line in lines(panels(figure).q[0], "limit") if len(points(line)) > 2]
-    assert [line.get_color() for line in curves] == [looks(["limit"])[0].colour]
+    assert [line.get_color() for line in curves] == [line_styles(["limit"])[0].colour]
 
 
 # --- inputs over time ---
@@ -388,7 +388,7 @@ def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Record
 
 def test_looks_are_different_and_their_colours_those_of_okabe_and_ito() -> None:
     """Black, orange, sky blue, bluish green, blue, vermillion and reddish purple, as published."""
-    found = [look[1:] for look in looks(map(str, range(28)))]
+    found = [look[1:] for look in line_styles(map(str, range(28)))]
     assert len(set(found)) == 28
     published = [(0, 0, 0), (230, 159, 0), (86, 180, 233), (0, 158, 115), (0, 114, 178), (213, 94, 0), (204, 121, 167)]
     colours = {matplotlib.colors.to_rgb(colour) for colour, _ in found}

@@ -54,9 +54,9 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
     }
     const double rounding = stops->any_watched ? rounding_of(stops, effort) : 0.0;
     for (int i = 0; i < N_JOINTS; i++) {
-        double *at[2] = {&indicator[i], &indicator[N_JOINTS + i]}, *rubs = &indicator[2 * N_JOINTS + i];
+        double *at[2] = {&indicator[i], &indicator[N_JOINTS + i]}, *friction = &indicator[2 * N_JOINTS + i];
         const int slip = stops->held[i] ? 0 : stops->slip[i], side = is_above(plant, q[i], i) ? 1 : -1;
-        *rubs = slip ? slip * v[i] + BACK + CLEARING * fmax(0.0, slip * a[i]) : 1.0;
+        *friction = slip ? slip * v[i] + BACK + CLEARING * fmax(0.0, slip * a[i]) : 1.0;
         *at[0] = room(high[i], high[i] - q[i], -v[i]);
         *at[1] = room(low[i], q[i] - low[i], v[i]);
         if (stops->held[i]) /* a joint without a range stays at rest */
@@ -64,7 +64,7 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
         if (stops->watched[i] && stops->held[i] != STUCK)
             *at[side > 0 ? 0 : 1] = grip(plant, stops, i, q[i], effort[i], side) + PULL + rounding;
         else if (stops->watched[i])
-            *rubs = fmin(grip(plant, stops, i, q[i], effort[i], -1), grip(plant, stops, i, q[i], effort[i], 1))
+            *friction = fmin(grip(plant, stops, i, q[i], effort[i], -1), grip(plant, stops, i, q[i], effort[i], 1))
                     + PULL * plant->value[FRICTION + i] + rounding;
     }
 #ifdef HAS_RCOND

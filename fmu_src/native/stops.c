@@ -74,8 +74,8 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
     double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0}, z[N_JOINTS];
     int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0, count = 1, finite = 1, bounded = 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        const int rubs = contact[i].there && contact[i].high > 0.0 && contact[i].low < 0.0;
-        const int rests = (contact[i].there && contact[i].fixed) || rubs || is_pressed(&contact[i], rate[i]);
+        const int resists = contact[i].there && contact[i].high > 0.0 && contact[i].low < 0.0;
+        const int rests = (contact[i].there && contact[i].fixed) || resists || is_pressed(&contact[i], rate[i]);
         contact[i].at = rests || !contact[i].there ? 0 : contact[i].side > 0.0 ? -1 : 1;
         free[i] = rests ? 0.0 : 1.0;
         any |= rests;

@@ -10,7 +10,7 @@ export class Engine {
     this.calls._initialize();
     this.call("engine_instantiate");
     this.room = 0;
-    this.places = this.values = 0;
+    this.indices = this.values = 0;
   }
 
   /** @param {Uint8Array} module */
@@ -27,27 +27,27 @@ export class Engine {
     throw new Error(new TextDecoder().decode(logged.subarray(0, logged.indexOf(0))) || name);
   }
 
-  /** @param {number[]} places */
-  prepare(places) {
-    if (places.length > this.room) {
-      this.room = places.length;
-      this.places = this.calls.engine_allocate(4 * this.room);
+  /** @param {number[]} indices */
+  prepare(indices) {
+    if (indices.length > this.room) {
+      this.room = indices.length;
+      this.indices = this.calls.engine_allocate(4 * this.room);
       this.values = this.calls.engine_allocate(8 * this.room);
     }
-    new Uint32Array(this.memory.buffer, this.places, places.length).set(places);
+    new Uint32Array(this.memory.buffer, this.indices, indices.length).set(indices);
   }
 
-  /** @type {(places: number[], values: number[]) => void} Set variables of any type: all, or none if one is refused. */
-  set(places, values) {
-    this.prepare(places);
+  /** @type {(indices: number[], values: number[]) => void} Set variables of any type: all, or none if one is refused. */
+  set(indices, values) {
+    this.prepare(indices);
     new Float64Array(this.memory.buffer, this.values, values.length).set(values);
-    this.call("engine_set", this.places, places.length, this.values);
+    this.call("engine_set", this.indices, indices.length, this.values);
   }
 
-  /** @param {number[]} places */
-  get(places) {
-    this.prepare(places);
-    this.call("engine_get", this.places, places.length, this.values);
-    return new Float64Array(this.memory.buffer, this.values, places.length);
+  /** @param {number[]} indices */
+  get(indices) {
+    this.prepare(indices);
+    this.call("engine_get", this.indices, indices.length, this.values);
+    return new Float64Array(this.memory.buffer, this.values, indices.length);
   }
 }

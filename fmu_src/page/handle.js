@@ -17,14 +17,14 @@ export class Handle {
    * @param {HTMLCanvasElement} canvas
    * @param {Camera} camera
    * @param {Samples} session
-   * @param {() => number[]} place position of the target in the root frame
+   * @param {() => number[]} position position of the target in the root frame
    * @param {(name: string, values: number[]) => void} onChange called with the new target
    */
-  constructor(canvas, camera, session, place, onChange) {
+  constructor(canvas, camera, session, position, onChange) {
     this.canvas = canvas;
     this.camera = camera;
     this.session = session;
-    this.place = place;
+    this.position = position;
     this.onChange = onChange;
     this.axes = session.steered && session.groups.has("x_des") ? session.axes : [];
     this.turns = session.steered && session.groups.has("quat_des");
@@ -76,7 +76,7 @@ export class Handle {
     this.drag = null;
     if (this.pointers.size > 1 || event.button !== 0) return;
     const ring = this.turns ? this.nearest(at, grip) : -1;
-    if (this.axes.length && this.distance(at, this.place()) < GRIP * grip) [this.drag, this.hint] = [this.carry(at), ""];
+    if (this.axes.length && this.distance(at, this.position()) < GRIP * grip) [this.drag, this.hint] = [this.carry(at), ""];
     else if (ring >= 0) this.drag = this.turn(at, ring);
   }
 
@@ -99,7 +99,7 @@ export class Handle {
   /** Move the target in the plane of the picture, or in the plane of two task axes. */
   /** @type {(at: number[]) => (x: number, y: number) => void} */
   carry(at) {
-    const begin = this.place(), { camera, axes } = this;
+    const begin = this.position(), { camera, axes } = this;
     let normal = camera.back;
     if (axes.length === 2) normal = base(this.session.free[0]);
     if (axes.length === 1) normal = unit(plus(normal, -normal[axes[0]], base(axes[0])));
@@ -107,8 +107,8 @@ export class Handle {
     return (/** @type {number} */ x, /** @type {number} */ y) => {
       const met = camera.meet(x, y, begin, normal);
       if (!met) return;
-      const place = plus(plus(begin, 1, met), -1, first);
-      this.onChange("x_des", axes.map((axis) => place[axis]));
+      const position = plus(plus(begin, 1, met), -1, first);
+      this.onChange("x_des", axes.map((axis) => position[axis]));
     };
   }
 
@@ -116,7 +116,7 @@ export class Handle {
   ring(axis) {
     const orientation = rotation(this.session.held("quat_des"));
     const [one, two] = [1, 2].map((i) => transform(orientation, base((axis + i) % 3)));
-    return circle(this.place(), RING * this.camera.size, one, two, RING_POINTS);
+    return circle(this.position(), RING * this.camera.size, one, two, RING_POINTS);
   }
 
   /** The axis of the ring nearest to a point of the picture, within `grip` pixels; else -1. */
@@ -129,13 +129,13 @@ export class Handle {
 
   /** @type {(at: number[], axis: number) => (x: number, y: number) => void} Rotate the target about one of its axes. */
   turn(at, axis) {
-    const place = this.place(), start = this.session.held("quat_des"), orientation = rotation(start);
+    const position = this.position(), start = this.session.held("quat_des"), orientation = rotation(start);
     const normal = transform(orientation, base(axis)), one = transform(orientation, base((axis + 1) % 3));
     const two = cross(normal, one);
     /** @type {(x: number, y: number) => number | null} */
     const angle = (x, y) => {
-      const met = this.camera.meet(x, y, place, normal);
-      const arm = met && plus(met, -1, place);
+      const met = this.camera.meet(x, y, position, normal);
+      const arm = met && plus(met, -1, position);
       return arm ? Math.atan2(dot(arm, two), dot(arm, one)) : null;
     };
     const first = angle(at[0], at[1]);

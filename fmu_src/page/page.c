@@ -63,31 +63,31 @@ void *EXPORT(engine_allocate)(size_t size)
 }
 
 /* Set variables of any type: all, or none if a value is refused. */
-int EXPORT(engine_set)(const int place[], size_t count, const double value[])
+int EXPORT(engine_set)(const int index[], size_t count, const double value[])
 {
     if (!enter(instance, SET_REAL, 1))
         return ERROR;
     for (size_t i = 0; i < count; i++) {
-        if (!accepts(instance, SET_REAL, place[i], value[i]))
+        if (!accepts(instance, SET_REAL, index[i], value[i]))
             return ERROR;
-        if (place[i] >= FIRST_INTEGER && place[i] < FIRST_BOOLEAN && value[i] != rint(value[i]))
-            return report(instance, ERROR, "%s = %g must be a whole number", VARIABLE_NAME[place[i]], value[i]);
+        if (index[i] >= FIRST_INTEGER && index[i] < FIRST_BOOLEAN && value[i] != rint(value[i]))
+            return report(instance, ERROR, "%s = %g must be a whole number", VARIABLE_NAME[index[i]], value[i]);
     }
     for (size_t i = 0; i < count; i++)
-        set(instance, place[i], place[i] >= FIRST_BOOLEAN ? value[i] != 0.0 : value[i]);
+        set(instance, index[i], index[i] >= FIRST_BOOLEAN ? value[i] != 0.0 : value[i]);
     return OK;
 }
 
-int EXPORT(engine_get)(const int place[], size_t count, double value[])
+int EXPORT(engine_get)(const int index[], size_t count, double value[])
 {
     if (!enter(instance, GET_REAL, 1))
         return ERROR;
     for (size_t i = 0; i < count; i++) {
-        const int computed = place[i] >= FIRST_OUTPUT && place[i] < FIRST_PARAMETER;
-        const Status status = computed ? update(instance, place[i]) : OK;
+        const int computed = index[i] >= FIRST_OUTPUT && index[i] < FIRST_PARAMETER;
+        const Status status = computed ? update(instance, index[i]) : OK;
         if (status > WARNING)
             return status;
-        value[i] = instance->state.plant.value[place[i]];
+        value[i] = instance->state.plant.value[index[i]];
     }
     return OK;
 }

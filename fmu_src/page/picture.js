@@ -65,8 +65,8 @@ export class Picture {
     if (!scene) return;
     if (this.slow === SLOW_FRAMES) scene.fineness = 1;
     const shadow = this.addFloor(scene, fractions(styled("--hair")));
-    robot.facts.shapes.forEach(({ link, place, colour }, i) => {
-      const model = multiply(links[link], place);
+    robot.facts.shapes.forEach(({ link, placement, colour }, i) => {
+      const model = multiply(links[link], placement);
       scene.addSolid(i + 1, model, [...colour, 1]);
       if (shadow && scene.fineness > 1) scene.addSolid(i + 1, multiply(shadow, model), [...fractions(styled("--shade")), 2]);
     });

@@ -40,7 +40,7 @@ export class Readout {
   }
 
   /** @type {(name: string, text: string) => void} */
-  tell(name, text) {
+  describe(name, text) {
     let cell = this.more.get(name);
     if (!cell) {
       cell = element("td", "");
@@ -58,14 +58,14 @@ export class Readout {
       ["q", "v", "tau"].forEach((group, c) => (this.cells[i][c].textContent = digits(session.value(group, k, i))));
       this.cells[i][0].className = stopped.includes(joint) ? "limit" : "";
     });
-    const places = /** @type {[string, number[]][]} */ (facts.links.length > 1 ? [["end effector", robot.end(k)]] : []);
-    if (places.length && session.groups.has("x_des")) places.push(["target", robot.target(k)]);
-    for (const [name, place] of places) this.tell(name, `(${place.map(digits).join(", ")}) m`);
+    const points = /** @type {[string, number[]][]} */ (facts.links.length > 1 ? [["end effector", robot.end(k)]] : []);
+    if (points.length && session.groups.has("x_des")) points.push(["target", robot.target(k)]);
+    for (const [name, point] of points) this.describe(name, `(${point.map(digits).join(", ")}) m`);
     const error = session.error(k), turn = robot.turnError(k), unit = session.groups.has("x_des") ? "m" : unitsOf(joints)[0];
     const errors = /** @type {[number, string][]} */ ([[error, unit], [turn, "rad"]]);
     const texts = errors.filter(([value]) => !Number.isNaN(value))
       .map(([value, of]) => `${Number((value < SMALLEST ? 0 : value).toPrecision(4))} ${of}`);
-    if (session.follows) this.tell("error", texts.join(", ") || "\u2013");
-    for (const [name, text] of session.remarks()) this.tell(name, text);
+    if (session.follows) this.describe("error", texts.join(", ") || "\u2013");
+    for (const [name, text] of session.remarks()) this.describe(name, text);
   }
 }

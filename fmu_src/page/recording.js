@@ -106,18 +106,18 @@ function* messages(session, robot) {
     for (const name of names) state.align(4).text(name, "\0");
     for (const group of ["q", "v", "tau"]) state.align(4).put(32, names.length).align(8).doubles(session.at(group, k));
     yield { topic: "/joint_states", stamp, data: state.content };
-    const place = robot.end(k);
-    yield { topic: "/end_effector", stamp, data: point(stamp, root, place, session.at("quat", k)) };
+    const position = robot.end(k);
+    yield { topic: "/end_effector", stamp, data: point(stamp, root, position, session.at("quat", k)) };
     if (session.groups.has("x_des")) {
-      session.axes.forEach((axis, i) => (place[axis] = session.at("x_des", k)[i]));
-      yield { topic: "/target", stamp, data: point(stamp, root, place, session.at("quat_des", k)) };
+      session.axes.forEach((axis, i) => (position[axis] = session.at("x_des", k)[i]));
+      yield { topic: "/target", stamp, data: point(stamp, root, position, session.at("quat_des", k)) };
     }
   }
 }
 
-/** @type {(stamp: bigint, frame: string, place: number[], quat: Float64Array) => Uint8Array} */
-function point(stamp, frame, place, quat) {
-  return headed(stamp, frame).align(8).doubles(place).doubles(quat).content;
+/** @type {(stamp: bigint, frame: string, position: number[], quat: Float64Array) => Uint8Array} */
+function point(stamp, frame, position, quat) {
+  return headed(stamp, frame).align(8).doubles(position).doubles(quat).content;
 }
 
 /** @type {(session: Session, robot: Robot) => Uint8Array} The session as an MCAP file. */
@@ -169,26 +169,26 @@ class Chunk {
   /** @param {string[]} topics */
   constructor(topics) {
     /** @type {[bigint, number][][]} times and offsets of each topic's messages */
-    this.places = topics.map(() => []);
+    this.messages = topics.map(() => []);
   }
 
   /** @type {(channel: number, stamp: bigint, data: Uint8Array) => void} */
   add(channel, stamp, data) {
-    this.places[channel - 1].push([stamp, this.records.length]);
+    this.messages[channel - 1].push([stamp, this.records.length]);
     this.times.push(stamp);
     this.records.record(OP.message, new Bytes().put(16, channel).put(32, 0).put(64, stamp, stamp).raw(data));
   }
 
   /** @type {(file: Bytes) => Bytes} Append the chunk and its indexes to a file; return the record of their offsets. */
   write(file) {
-    const { records, places } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
+    const { records } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
     const content = new Bytes().put(64, start, end, records.length).put(32, 0).text("").put(64, records.length);
     file.record(OP.chunk, content.raw(records.content));
     const size = file.length - at, offsets = new Bytes(), first = file.length;
-    places.forEach((entries, i) => {
+    this.messages.forEach((entries, i) => {
       offsets.put(16, i + 1).put(64, file.length);
       const index = new Bytes().put(16, i + 1).put(32, 16 * entries.length);
-      for (const [stamp, place] of entries) index.put(64, stamp, place);
+      for (const [stamp, offset] of entries) index.put(64, stamp, offset);
       file.record(OP.messageIndex, index);
     });
     return new Bytes().put(64, start, end, at, size).put(32, offsets.length).raw(offsets.content)

@@ -19,13 +19,13 @@ export class Robot {
   /** @type {(q: Numbers) => Float64Array[]} Transforms of all links at positions q, rad or m. */
   linksAt(q) {
     /** @type {Float64Array[]} */
-    const places = [placed([0, 0, 0])];
-    for (const { parent, place, axis, prismatic, column, ratio, offset } of this.facts.links.slice(1)) {
+    const placements = [placed([0, 0, 0])];
+    for (const { parent, placement, axis, prismatic, column, ratio, offset } of this.facts.links.slice(1)) {
       const moved = offset + (column < 0 ? 0 : ratio * q[column]);
       const inner = prismatic ? placed(plus([0, 0, 0], moved, axis)) : turn(axis, moved);
-      places.push(multiply(multiply(places[parent], place), inner));
+      placements.push(multiply(multiply(placements[parent], placement), inner));
     }
-    return places;
+    return placements;
   }
 
   /** @type {(k: number) => Float64Array} The transform of the task frame in sample k. */
@@ -40,9 +40,9 @@ export class Robot {
 
   /** The position of the target; on uncontrolled axes that of the end effector. */
   target(k = this.session.now) {
-    const { session } = this, place = this.end(k), given = session.target("x_des", k);
-    if (given.length) session.axes.forEach((axis, i) => (place[axis] = given[i]));
-    return place;
+    const { session } = this, position = this.end(k), given = session.target("x_des", k);
+    if (given.length) session.axes.forEach((axis, i) => (position[axis] = given[i]));
+    return position;
   }
 
   /** @type {(k: number) => number} Angle from the target orientation in sample k, rad; NaN without a target. */
@@ -69,8 +69,8 @@ export class Robot {
     if (first < 0) return null;
     let radius = 0;
     for (const i of chain.slice(first)) {
-      const { place, prismatic, column } = this.facts.links[i];
-      if (i !== chain[first]) radius += Math.hypot(...originOf(place));
+      const { placement, prismatic, column } = this.facts.links[i];
+      if (i !== chain[first]) radius += Math.hypot(...originOf(placement));
       if (prismatic && column >= 0) {
         const { low, high } = this.facts.joints[column];
         radius += Math.max(Math.abs(low ?? Infinity), Math.abs(high ?? Infinity));

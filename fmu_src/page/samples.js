@@ -154,7 +154,7 @@ export class Samples {
   /** Distance of the end effector from its target, m, or of the joints from theirs; NaN without a target. */
   error(k = this.now) {
     if (!this.follows) return NaN;
-    const [now, wanted] = this.follows, place = this.at(now, k);
-    return Math.hypot(...this.target(wanted, k).map((value, i) => value - place[i]));
+    const [now, wanted] = this.follows, position = this.at(now, k);
+    return Math.hypot(...this.target(wanted, k).map((value, i) => value - position[i]));
   }
 }

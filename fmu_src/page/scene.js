@@ -7,11 +7,11 @@ import { plus, unit } from "./matrices.js";
 const SOLID = [
   `#version 300 es
   uniform mat4 view, model; uniform vec3 low; uniform float size;
-  layout(location = 0) in vec3 place; layout(location = 1) in vec3 normal;
+  layout(location = 0) in vec3 vertex; layout(location = 1) in vec3 normal;
   out vec3 rotated;
   void main() {
     rotated = mat3(model) * normal;
-    gl_Position = view * model * vec4(low + size * place, 1.0);
+    gl_Position = view * model * vec4(low + size * vertex, 1.0);
   }`,
   `#version 300 es
   precision highp float;
@@ -67,11 +67,11 @@ export class Scene {
     this.facts = facts;
     let offset = 0;
     this.meshes = facts.meshes.map((mesh) => {
-      const places = new Uint16Array(meshes, offset, 3 * mesh.vertices);
-      offset += 4 * Math.ceil(places.byteLength / 4);
+      const vertices = new Uint16Array(meshes, offset, 3 * mesh.vertices);
+      offset += 4 * Math.ceil(vertices.byteLength / 4);
       const triangles = new Uint32Array(meshes, offset, 3 * mesh.triangles);
       offset += triangles.byteLength;
-      return { ...mesh, ...this.upload(places, triangles) };
+      return { ...mesh, ...this.upload(vertices, triangles) };
     });
     this.linesBuffer = /** @type {WebGLBuffer} */ (gl.createBuffer());
     this.linesArray = gl.createVertexArray();
@@ -101,11 +101,11 @@ export class Scene {
     return program;
   }
 
-  /** @type {(places: Uint16Array, triangles: Uint32Array) => {array: WebGLVertexArrayObject | null, count: number}} */
-  upload(places, triangles) {
+  /** @type {(vertices: Uint16Array, triangles: Uint32Array) => {array: WebGLVertexArrayObject | null, count: number}} */
+  upload(vertices, triangles) {
     const { gl } = this, array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    const { corners, normals, indices } = smoothed(places, triangles);
+    const { corners, normals, indices } = smoothed(vertices, triangles);
     for (const [i, [content, type]] of /** @type {const} */ ([[corners, gl.UNSIGNED_SHORT], [normals, gl.BYTE]]).entries()) {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ARRAY_BUFFER, content, gl.STATIC_DRAW);
@@ -198,12 +198,12 @@ export class Scene {
  * The drawn parts of a mesh: points, each with its normal and padded to four numbers, and the corners of
  * triangles among them. A vertex is there once for each normal that it has, which is the mean of the faces
  * about it that are not at a sharp edge to the corner's own.
- * @param {Uint16Array} places
+ * @param {Uint16Array} vertices
  * @param {Uint32Array} triangles
  */
-function smoothed(places, triangles) {
-  const { length } = triangles, count = places.length / 3;
-  const faces = facesOf(places, triangles), [begins, around] = facesAround(count, triangles);
+function smoothed(vertices, triangles) {
+  const { length } = triangles, count = vertices.length / 3;
+  const faces = facesOf(vertices, triangles), [begins, around] = facesAround(count, triangles);
   const corners = new Uint16Array(4 * length), normals = new Int8Array(4 * length), indices = new Uint32Array(length);
   const newest = new Int32Array(count).fill(-1), older = new Int32Array(length); // drawn vertices of each vertex
   let made = 0;
@@ -220,7 +220,7 @@ function smoothed(places, triangles) {
     let same = newest[vertex];
     while (same >= 0 && [0, 1, 2].some((i) => normals[4 * same + i] !== normals[4 * made + i])) same = older[same];
     if (same < 0) {
-      corners.set(places.subarray(3 * vertex, 3 * vertex + 3), 4 * made);
+      corners.set(vertices.subarray(3 * vertex, 3 * vertex + 3), 4 * made);
       [older[made], newest[vertex], same] = [newest[vertex], made, made];
       made += 1;
     }
@@ -230,13 +230,13 @@ function smoothed(places, triangles) {
 }
 
 /** Normals of triangles, with the length of twice the area; a normal has the index of the triangle's first corner. */
-/** @type {(places: Uint16Array, triangles: Uint32Array) => Float64Array} */
-function facesOf(places, triangles) {
+/** @type {(vertices: Uint16Array, triangles: Uint32Array) => Float64Array} */
+function facesOf(vertices, triangles) {
   const faces = new Float64Array(triangles.length);
   for (let t = 0; t < triangles.length; t += 3) {
     const [a, b, c] = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
-    const [ux, uy, uz] = [places[b] - places[a], places[b + 1] - places[a + 1], places[b + 2] - places[a + 2]];
-    const [vx, vy, vz] = [places[c] - places[a], places[c + 1] - places[a + 1], places[c + 2] - places[a + 2]];
+    const [ux, uy, uz] = [vertices[b] - vertices[a], vertices[b + 1] - vertices[a + 1], vertices[b + 2] - vertices[a + 2]];
+    const [vx, vy, vz] = [vertices[c] - vertices[a], vertices[c + 1] - vertices[a + 1], vertices[c + 2] - vertices[a + 2]];
     [faces[t], faces[t + 1], faces[t + 2]] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
   }
   return faces;

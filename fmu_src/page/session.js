@@ -22,7 +22,7 @@ export class Session extends Samples {
     super(facts, false);
     this.engine = engine;
     const names = facts.recorded.flatMap((group) => this.groups.get(group) ?? []);
-    this.places = names.map((name) => this.variable(name).place);
+    this.indices = names.map((name) => this.variable(name).index);
     this.startAgain();
   }
 
@@ -37,7 +37,7 @@ export class Session extends Samples {
     this.k = this.count = this.due = 0;
     this.changes = [];
     this.begun = Date.now();
-    this.append(this.engine.get(this.places));
+    this.append(this.engine.get(this.indices));
   }
 
   /** Groups of inputs and parameters that differ from the FMU's, as the fragment of a URL. */
@@ -66,8 +66,8 @@ export class Session extends Samples {
 
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
-    const places = pairs.map(([name]) => this.variable(name).place);
-    this.engine.set(places, pairs.map(([, value]) => Number(value)));
+    const indices = pairs.map(([name]) => this.variable(name).index);
+    this.engine.set(indices, pairs.map(([, value]) => Number(value)));
   }
 
   /** @type {(name: string, value: Value | number[]) => void} Set inputs, which apply from the next step on; a parameter
@@ -129,11 +129,11 @@ export class Session extends Samples {
         throw new Error("the recording is full: download it, then reset");
       this.engine.call("engine_step", this.time(this.k), this.facts.step);
       this.k += 1;
-      this.append(this.engine.get(this.places));
+      this.append(this.engine.get(this.indices));
     }
   }
 
   record() {
-    this.append(this.engine.get(this.places));
+    this.append(this.engine.get(this.indices));
   }
 }

@@ -13,7 +13,7 @@ interface JointFacts {
 
 interface Link {
   parent: number;
-  place: number[];
+  placement: number[];
   axis: number[];
   prismatic: boolean;
   column: number;
@@ -25,7 +25,7 @@ interface Link {
 interface Variable {
   name: string;
   /** Index among the FMU's variables; elements of a vector follow each other. */
-  place: number;
+  index: number;
   causality: string;
   type: "Real" | "Integer" | "Boolean";
   unit: string;
@@ -48,7 +48,7 @@ interface Facts {
   variables: Variable[];
   links: Link[];
   frameLink: number;
-  shapes: { link: number; place: number[]; colour: number[] }[];
+  shapes: { link: number; placement: number[]; colour: number[] }[];
   meshes: { low: number[]; size: number; vertices: number; triangles: number }[];
   /** Only for a page with an engine: provenance and topics of its bags. */
   provenance: Record<string, unknown>;

@@ -79,7 +79,7 @@ export class Verdict {
 
   /** Position of the end effector along the task axes. */
   /** @type {(q: number[]) => number[]} */
-  place(q) {
+  pointOf(q) {
     const { robot } = this, end = originOf(robot.linksAt(q)[robot.facts.frameLink]);
     return this.session.axes.map((axis) => end[axis]);
   }
@@ -89,7 +89,7 @@ export class Verdict {
   jacobian(q) {
     const h = 1e-6;
     /** @type {(i: number, by: number) => number[]} */
-    const moved = (i, by) => this.place(q.map((value, k) => (k === i ? value + by : value)));
+    const moved = (i, by) => this.pointOf(q.map((value, k) => (k === i ? value + by : value)));
     return q.map((_, i) => {
       const before = moved(i, -h);
       return moved(i, h).map((value, k) => (value - before[k]) / (2 * h));
@@ -102,10 +102,10 @@ export class Verdict {
     const limits = this.joints.map((_, i) => this.limits(i)), first = [...this.session.at("q")];
     const asked = `${wanted}; ${limits}`;
     if (asked === this.asked) return this.best;
-    let best = { point: this.place(first), distance: Infinity };
+    let best = { point: this.pointOf(first), distance: Infinity };
     for (let q of [first, ...this.scattered(limits, wanted)]) {
       if (best.distance <= FLOOR) break;
-      let e = off(wanted, this.place(q)), damping = 1e-3;
+      let e = off(wanted, this.pointOf(q)), damping = 1e-3;
       for (let k = 0; k < TRIES && Math.hypot(...e) > FLOOR / 10; k++) {
         const rows = this.jacobian(q).map((row, i) => {
           const slope = row.reduce((sum, value, a) => sum + value * e[a], 0);
@@ -113,13 +113,13 @@ export class Verdict {
         });
         const y = solved(squared(rows, damping), e);
         const next = q.map((value, i) => Math.min(Math.max(value + rows[i].reduce((sum, s, a) => sum + s * y[a], 0), limits[i][0]), limits[i][1]));
-        const left = off(wanted, this.place(next)), gain = Math.hypot(...e) - Math.hypot(...left);
+        const left = off(wanted, this.pointOf(next)), gain = Math.hypot(...e) - Math.hypot(...left);
         if (gain > 0) [q, e] = [next, left];
         damping *= gain > 0 ? 0.3 : 10;
         if (damping > 1e9 || (gain > 0 && gain < 1e-12)) break;
       }
       const distance = Math.hypot(...e);
-      if (distance < best.distance - 1e-9) best = { point: this.place(q), distance };
+      if (distance < best.distance - 1e-9) best = { point: this.pointOf(q), distance };
     }
     [this.asked, this.best] = [asked, best];
     return best;
@@ -136,7 +136,7 @@ export class Verdict {
     for (let k = 0; k < 40; k++) g = (1 + g) ** (1 / (limits.length + 1));
     const starts = Array.from({ length: SCATTERED }, (_, k) => {
       const q = ends.map(([low, high], i) => low + ((k / g ** (i + 1)) % 1) * (high - low));
-      return { q, distance: Math.hypot(...off(wanted, this.place(q))) };
+      return { q, distance: Math.hypot(...off(wanted, this.pointOf(q))) };
     });
     return starts.sort((a, b) => a.distance - b.distance).slice(0, IMPROVED).map(({ q }) => q);
   }

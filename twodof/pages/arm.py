@@ -143,14 +143,14 @@ def arm_of(run: Experiment) -> Arm:
     variables = [
         {
             "name": name,
-            "place": place,
+            "index": index,
             "causality": variable.causality,
             "type": variable.type,
             "unit": variable.unit or "",
             "start": run.start_values.get(name),
             "description": variable.description,
         }
-        for place, (name, variable) in enumerate(fmu.variables.items())
+        for index, (name, variable) in enumerate(fmu.variables.items())
         if variable.causality != "local"
     ]
     known = {key: getattr(fmu, key) for key in ("name", "robot", "joints", "frame", "axes", "control")}
@@ -212,7 +212,7 @@ def _facts(arm: Arm) -> tuple[dict[str, object], bytes]:
         "recorded": RECORDED,
         "links": links,
         "frameLink": number[arm.facts["frame"]],
-        "shapes": [{"link": number[s.link], "place": _matrix(s.transform), "colour": s.colour} for s in arm.shapes],
+        "shapes": [{"link": number[s.link], "placement": _matrix(s.transform), "colour": s.colour} for s in arm.shapes],
         "meshes": [facts for facts, _ in packed],
     }
     return facts, b"".join(content for _, content in packed)
@@ -238,7 +238,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], 
         links.append(
             {
                 "parent": number[joint.parent],
-                "place": _matrix(Placement(np.array(joint.xyz), kinematics.origins[joint.name])),
+                "placement": _matrix(Placement(np.array(joint.xyz), kinematics.origins[joint.name])),
                 "axis": joint.axis,
                 "prismatic": joint.prismatic,
                 "column": -1 if column is None else column,

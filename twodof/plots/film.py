@@ -19,7 +19,7 @@ from .figure import Drawing, draw_head, drawn
 from .panels import title
 from .runs import draw_view
 from .settings import number
-from .strokes import GREY, Style, looks
+from .strokes import GREY, Style, line_styles
 from .track import Track, read_tracks
 from .words import common_settings, outcome
 from .workspace import views
@@ -116,7 +116,7 @@ def _draw(track: Track, figure: Figure) -> None:
     """Draw the static parts, and the arm of each view as its last line, which is moved later."""
     room = draw_head(figure, title([track]), [common_settings([track]), *outcome(track)[:1]], SIZE)
     figure.set_size_inches(SIZE)
-    every = views([track], {(0, ""): looks([track.name])[0]})
+    every = views([track], {(0, ""): line_styles([track.name])[0]})
     for axes, view in zip(room.subplots(1, len(every), squeeze=False)[0], every):
         arms = [stroke for stroke in view.strokes if stroke.label == "arm at the end"]
         others = [stroke for stroke in view.strokes if stroke.label != "arm at the end"]

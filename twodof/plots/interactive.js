@@ -60,7 +60,7 @@ class Legend {
   }
 
   /** @param {Hovered[]} points under the cursor: of each curve the nearest */
-  tell(points) {
+  report(points) {
     for (const cell of this.cells.values()) cell.textContent = "";
     const latest = Math.max(...points.map(({ x }) => x));
     for (const { data, fullData, pointNumber, x, y } of points) {
@@ -75,7 +75,7 @@ class Legend {
 async function drawPlots() {
   /** @type {{figures: Chart[], rows: Row[]}} */
   const { figures, rows } = await plotlyContent();
-  const place = /** @type {HTMLElement} */ (document.getElementById("plots"));
+  const element = /** @type {HTMLElement} */ (document.getElementById("plots"));
   const shown = new Set(figures[0].data.map((trace) => trace.meta[2]));
   const kinds = Object.keys(UNITS_OF).filter((kind) => shown.has(kind));
   const drawn = figures.map(() => Object.assign(document.createElement("div"), { className: "plot" }));
@@ -86,13 +86,13 @@ async function drawPlots() {
   });
   const side = Object.assign(document.createElement("div"), { id: "side" });
   side.append(legend.table, ...drawn.slice(1));
-  place.append(drawn[0], side);
+  element.append(drawn[0], side);
   const config = { responsive: true, displaylogo: false, doubleClick: "reset", modeBarButtonsToRemove: ["select2d", "lasso2d"] };
   await Promise.all(figures.map(({ data, layout }, i) => Plotly.newPlot(drawn[i], data, layout, config)));
   const hearing = /** @type {any} */ (drawn[0]);
-  hearing.on("plotly_hover", (/** @type {any} */ event) => legend.tell(event.points));
-  hearing.on("plotly_unhover", () => legend.tell([]));
-  place.dataset.ready = "";
+  hearing.on("plotly_hover", (/** @type {any} */ event) => legend.report(event.points));
+  hearing.on("plotly_unhover", () => legend.report([]));
+  element.dataset.ready = "";
 }
 
 drawPlots();

@@ -15,9 +15,9 @@ import numpy as np
 from ..errors import PlotError
 from ..export.closed_form import Array
 from ..version import needing
-from .panels import CURVE, HELD, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
+from .panels import CURVE, HELD, KINDS, TARGET, LineStyles, Panel, duration, joint_names, panels_of
 from .scripts import packed, script
-from .strokes import GREY, HAIR, INK, Stroke, looks
+from .strokes import GREY, HAIR, INK, Stroke, line_styles
 from .track import Track
 from .words import labels
 from .workspace import View, views, workspace_title
@@ -133,9 +133,9 @@ def _thinned(tracks: Sequence[Track], figure: Chart) -> str:
     return text
 
 
-def _looks(tracks: Sequence[Track]) -> Looks:
+def _line_styles(tracks: Sequence[Track]) -> LineStyles:
     """Return styles: colours distinguish tracks or joints, whichever are more, and dashes the others."""
-    bags, joints = looks(labels(tracks)), looks(joint_names(tracks))
+    bags, joints = line_styles(labels(tracks)), line_styles(joint_names(tracks))
     by_bag = len(bags) > len(joints)
     own = {}
     for i, bag in enumerate(bags):
@@ -152,11 +152,11 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, object]]:
         {
             "bag": i,
             "joint": joint,
-            "label": look.label,
-            "colour": look.colour,
-            "dashes": ",".join(f"{CURVE * part:g}" for part in look.dashes),
+            "label": line.label,
+            "colour": line.colour,
+            "dashes": ",".join(f"{CURVE * part:g}" for part in line.dashes),
         }
-        for (i, joint), look in _looks(tracks).items()
+        for (i, joint), line in _line_styles(tracks).items()
     ]
 
 
@@ -165,7 +165,7 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, object]]:
 
 def over_time(tracks: Sequence[Track]) -> Chart:
     """Return a figure with a row for each quantity, on one time axis."""
-    own = _looks(tracks)
+    own = _line_styles(tracks)
     rows: dict[str, list[Panel]] = {}
     for panel in sorted(panels_of(tracks, own), key=lambda panel: [*KINDS].index(panel.kind)):
         heading = f"{KINDS[panel.kind]} in {panel.unit}"
@@ -244,7 +244,7 @@ def _heading(text: str, top: float) -> dict[str, object]:
 
 def in_workspace(tracks: Sequence[Track]) -> list[dict[str, object]]:
     """Return a figure for each view."""
-    return [_view(view, workspace_title(tracks)) for view in views(tracks, _looks(tracks))]
+    return [_view(view, workspace_title(tracks)) for view in views(tracks, _line_styles(tracks))]
 
 
 def _view(view: View, title: str) -> dict[str, object]:

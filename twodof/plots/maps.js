@@ -17,19 +17,19 @@ function layout() {
 }
 
 class SweepPage {
-  /** @param {Sweep} sweep @param {HTMLElement} place */
-  constructor(sweep, place) {
+  /** @param {Sweep} sweep @param {HTMLElement} element */
+  constructor(sweep, element) {
     this.sweep = sweep;
     this.runs = /** @type {number[]} */ (sweep.columns.run);
     this.chosen = Math.max(0, this.runs.indexOf(sweep.best[0] ?? -1));
     const names = Object.keys(sweep.metrics), every = [...sweep.varied, ...names];
     const [x, y] = [sweep.varied[0], sweep.varied[1] ?? names[0]];
     this.charts = [
-      this.chart(place, "map", [x, y, names[0]], [sweep.varied, every, names]),
-      this.chart(place, "map", [x, y, names.includes("peak_effort") ? "peak_effort" : names[names.length - 1]], [sweep.varied, every, names]),
-      this.chart(place, "front", [names[0], names.includes("peak_effort") ? "peak_effort" : names[1] ?? names[0]], [names, names]),
+      this.chart(element, "map", [x, y, names[0]], [sweep.varied, every, names]),
+      this.chart(element, "map", [x, y, names.includes("peak_effort") ? "peak_effort" : names[names.length - 1]], [sweep.varied, every, names]),
+      this.chart(element, "front", [names[0], names.includes("peak_effort") ? "peak_effort" : names[1] ?? names[0]], [names, names]),
     ];
-    this.detail = place.appendChild(Object.assign(document.createElement("section"), { className: "run" }));
+    this.detail = element.appendChild(Object.assign(document.createElement("section"), { className: "run" }));
     this.curve = document.createElement("div");
     this.draw();
     dark.addEventListener("change", () => this.draw());
@@ -41,9 +41,9 @@ class SweepPage {
     return (this.sweep.metrics[name] ?? name) + (unit ? `, ${unit.replace(".", "·")}` : "");
   }
 
-  /** @param {HTMLElement} place @param {string} kind @param {string[]} shown @param {string[][]} choices */
-  chart(place, kind, shown, choices) {
-    const box = place.appendChild(document.createElement("section")), head = box.appendChild(document.createElement("p"));
+  /** @param {HTMLElement} element @param {string} kind @param {string[]} shown @param {string[][]} choices */
+  chart(element, kind, shown, choices) {
+    const box = element.appendChild(document.createElement("section")), head = box.appendChild(document.createElement("p"));
     const words = kind === "front" ? ["Pareto front of", "and"] : ["across", "up", "colour"];
     shown.forEach((name, i) => {
       const label = head.appendChild(document.createElement("label")), select = document.createElement("select");
@@ -99,11 +99,11 @@ class SweepPage {
         this.draw();
       });
     }
-    this.tell();
+    this.describe();
   }
 
   /** Show the selected run: its numbers, the command that repeats it, and its curves, if it has a bag. */
-  tell() {
+  describe() {
     const { columns, outcome, beyond, varied, metrics, curves, fmu, settings } = this.sweep, k = this.chosen, run = this.runs[k];
     const number = (/** @type {string} */ name) => Number(columns[name][k]).toPrecision(4);
     const known = Object.keys(metrics).filter((name) => columns[name][k] !== null);
@@ -124,9 +124,9 @@ class SweepPage {
 }
 
 async function drawMaps() {
-  const place = /** @type {HTMLElement} */ (document.getElementById("maps"));
-  Object.assign(window, { sweepPage: new SweepPage(await plotlyContent(), place) });
-  place.dataset.ready = "";
+  const element = /** @type {HTMLElement} */ (document.getElementById("maps"));
+  Object.assign(window, { sweepPage: new SweepPage(await plotlyContent(), element) });
+  element.dataset.ready = "";
 }
 
 drawMaps();

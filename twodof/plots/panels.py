@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import PlotError, choice
 from ..export.closed_form import Array
 from .settings import number
-from .strokes import ALARM, PALE, SMALLEST_ERROR, SMALLEST_RANGE, Look, Stroke
+from .strokes import ALARM, PALE, SMALLEST_ERROR, SMALLEST_RANGE, LineStyle, Stroke
 from .track import JointTrack, Track
 
 KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort", "error": "Distance from the target"}
@@ -27,7 +27,7 @@ MARKS = {"limit": "at its limit", "friction": "sticks", "saturation": "saturated
 """Panels in which causes are marked at their first occurrence, and the names of the marks."""
 SETTLED = "within 2 % from here on"
 TARGET, HELD = "thin dashes: target", "grey band: held by friction"
-Looks = Mapping[tuple[int, str], Look]
+LineStyles = Mapping[tuple[int, str], LineStyle]
 """Styles of each track's joints; the joint "" has the style of the track itself."""
 
 
@@ -83,36 +83,36 @@ def duration(tracks: Sequence[Track]) -> float:
     return max(float(track.t[-1]) for track in tracks) or 1.0
 
 
-def panels_of(tracks: Sequence[Track], looks: Looks) -> list[Panel]:
+def panels_of(tracks: Sequence[Track], line_styles: LineStyles) -> list[Panel]:
     """Return the panels of each joint for the known KINDS, then the panel of the error, if it is known."""
     joints = [joint for track in tracks for joint in track.joints]
     kinds = [kind for kind in UNITS if any(getattr(joint, kind).size for joint in joints)]
     names = joint_names(tracks)
-    panels = [_joint_panel(kind, name, tracks, looks) for name in names for kind in kinds]
-    error = _error_panel(tracks, looks)
+    panels = [_joint_panel(kind, name, tracks, line_styles) for name in names for kind in kinds]
+    error = _error_panel(tracks, line_styles)
     return [*panels, error] if error else panels
 
 
-def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) -> Panel:
+def _joint_panel(kind: str, name: str, tracks: Sequence[Track], line_styles: LineStyles) -> Panel:
     own = [(i, t, joint) for i, t in enumerate(tracks) for joint in t.joints if joint.name == name]
     curves, targets, lines, limits, words = [], [], [], [], []
     for i, track, joint in own:
-        look = looks[i, name]
+        line = line_styles[i, name]
         values = getattr(joint, kind)
         if not values.size:
             continue
-        curves.append(_curve(look.label, i, track.t, values, look, joint=name, kind=kind))
+        curves.append(_curve(line.label, i, track.t, values, line, joint=name, kind=kind))
         if kind == "q" and joint.target.size:
-            thin = Look("target", look.colour, (3, 2))
+            thin = LineStyle("target", line.colour, (3, 2))
             targets.append(_curve("target", i, track.t, joint.target, thin, THIN, 1.95, joint=name))
         if kind == "q" and np.isfinite(joint.stuck).any():
-            wide = Look(HELD, PALE, ())
+            wide = LineStyle(HELD, PALE, ())
             targets.append(_curve(wide.label, i, track.t, joint.stuck, wide, THICK, 1.85, joint=name))
         targets += _events(i, kind, joint, track)
         own_limits = _limits(kind, joint)
         for limit in own_limits:
             ends, level = np.array([0.0, duration(tracks)]), np.array([limit, limit])
-            dashed = Look("limit", look.colour, (7, 2, 1.5, 2))
+            dashed = LineStyle("limit", line.colour, (7, 2, 1.5, 2))
             lines.append(_curve("limit", i, ends, level, dashed, THIN, 1.9, joint=name))
         limits += own_limits
         words.append(_note(own_limits))
@@ -147,7 +147,7 @@ def _curve(
     track: int,
     t: Array,
     y: Array,
-    look: Look,
+    line: LineStyle,
     width: float = CURVE,
     depth: float = 2.0,
     *,
@@ -155,7 +155,7 @@ def _curve(
     kind: str = "",
 ) -> Stroke:
     mark = "." * (len(t) == 1)
-    return Stroke(label, track, t, y, look.colour, width, look.dashes, mark, depth, joint=joint, kind=kind)
+    return Stroke(label, track, t, y, line.colour, width, line.dashes, mark, depth, joint=joint, kind=kind)
 
 
 def _limits(kind: str, joint: JointTrack) -> list[float]:
@@ -172,7 +172,7 @@ def _note(limits: Sequence[float]) -> str:
     return f"limit{'s' * (len(texts) - 1)} {', '.join(texts)}" if texts else ""
 
 
-def _error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
+def _error_panel(tracks: Sequence[Track], line_styles: LineStyles) -> Panel | None:
     """Return the distance from the target over whole decades, with the closed form; None without a target."""
     tasks = [(i, track.t, track.task) for i, track in enumerate(tracks) if track.task]
     if not tasks:
@@ -183,7 +183,7 @@ def _error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
     note = "" if error.max() >= 10.0**low else f"less than {10.0**low:g} m throughout"
     disturbances = dict.fromkeys(chain(*(task.disturbances for _, _, task in tasks)))
     name = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
-    exact = Look("\n".join(textwrap.wrap(name, 36)), PALE, ())
+    exact = LineStyle("\n".join(textwrap.wrap(name, 36)), PALE, ())
     strokes = [
         _curve(exact.label, i, t, task.closed_form, exact, THICK, 1.5)
         for i, t, task in tasks
@@ -194,6 +194,6 @@ def _error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
         if 0.0 < settling < inf:
             k = min(int(np.searchsorted(t, settling)), len(t) - 1)
             at, dot = t[k : k + 1], task.error[k : k + 1]
-            strokes.append(Stroke(SETTLED, i, at, dot, looks[i, ""].colour, 0.0, mark="v", depth=6.0))
-        strokes.append(_curve(looks[i, ""].label, i, t, task.error, looks[i, ""], kind="error"))
+            strokes.append(Stroke(SETTLED, i, at, dot, line_styles[i, ""].colour, 0.0, mark="v", depth=6.0))
+        strokes.append(_curve(line_styles[i, ""].label, i, t, task.error, line_styles[i, ""], kind="error"))
     return Panel("error", "", "m", tuple(strokes), note, (10.0**low, 10.0**high))

@@ -18,7 +18,7 @@ from .figure import Drawing, draw_head, drawn
 from .interactive import body
 from .panels import HELD, KINDS, TARGET, UNITS, Panel, duration, joint_names, panels_of, title
 from .settings import number
-from .strokes import GREY, INK, Stroke, Style, looks
+from .strokes import GREY, INK, Stroke, Style, line_styles
 from .track import Track, read_tracks
 from .words import common_settings, labels, outcome, summary
 from .workspace import View, views, workspace_title
@@ -71,9 +71,9 @@ def drawing(tracks: Sequence[Track]) -> Drawing:
 
 def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     """Draw the joints, the error below them, and the workspace next to them."""
-    bags = looks(labels(tracks))
+    bags = line_styles(labels(tracks))
     names = ["", *joint_names(tracks)]
-    own = {(i, name): look for i, look in enumerate(bags) for name in names}
+    own = {(i, name): line for i, line in enumerate(bags) for name in names}
     panels, pictures = panels_of(tracks, own), views(tracks, own)
     error = panels.pop() if panels[-1].kind == "error" else None
     kinds = len({panel.kind for panel in panels})
@@ -91,7 +91,7 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     texts += [f"▼ {', '.join(named)}"] if (named := _marked([*panels, *([error] if error else [])])) else []
     texts += outcome(tracks[0]) if len(tracks) == 1 else []
     size = width + BESIDE * bool(pictures), height
-    handles = [Line2D([], [], label=look.label, **_line(look.colour, look.dashes)) for look in bags * (len(bags) > 1)]
+    handles = [Line2D([], [], label=line.label, **_line(line.colour, line.dashes)) for line in bags * (len(bags) > 1)]
     room = draw_head(figure, title(tracks), texts, size, handles)
     if pictures:
         cells = room.add_gridspec(2, 2, width_ratios=(width, BESIDE), height_ratios=(most, max(height - most, 1e-3)))
@@ -208,15 +208,15 @@ def _line(colour: str, dashes: Sequence[float]) -> Style:
 def _draw_strokes(axes: Axes, strokes: Iterable[Stroke]) -> None:
     """Draw lines, those with the lowest depth first."""
     for stroke in strokes:
-        look = {**_line(stroke.colour, stroke.dashes), "label": stroke.label}
-        look |= {"linewidth": stroke.width, "zorder": stroke.depth}
+        line = {**_line(stroke.colour, stroke.dashes), "label": stroke.label}
+        line |= {"linewidth": stroke.width, "zorder": stroke.depth}
         if not stroke.is_whole:
-            axes.plot(stroke.x, stroke.y, **{**look, **_marks(stroke)})
+            axes.plot(stroke.x, stroke.y, **{**line, **_marks(stroke)})
             continue
         for value in stroke.x:
-            axes.axvline(value, **look)
+            axes.axvline(value, **line)
         for value in stroke.y:
-            axes.axhline(value, **look)
+            axes.axhline(value, **line)
 
 
 def _marks(stroke: Stroke) -> Style:

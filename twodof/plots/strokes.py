@@ -25,7 +25,7 @@ SMALLEST_RANGE = 1e-3  # rad, m, rad/s, m/s: smaller motion is shown as rest
 SMALLEST_ERROR = 1e-12  # m: smaller errors are rounding errors
 
 
-class Look(NamedTuple):
+class LineStyle(NamedTuple):
     """Style of a curve: a colour and one of DASHES."""
 
     label: str
@@ -79,9 +79,9 @@ class Stroke(NamedTuple):
         return self._replace(x=self.x[kept], y=self.y[kept])
 
 
-def looks(names: Iterable[str]) -> list[Look]:
+def line_styles(names: Iterable[str]) -> list[LineStyle]:
     """Return a style for each name."""
-    return [Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]) for i, name in enumerate(names)]
+    return [LineStyle(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]) for i, name in enumerate(names)]
 
 
 def downsampled(values: Array, most: int) -> Indices:

@@ -33,7 +33,7 @@ class JointTrack:
         effort, speed: limits of the URDF, N·m or N, rad/s or m/s; None if unknown.
         q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample, N
             values each; unknown ones are empty.
-        rubs: whether it has friction.
+        has_friction: whether it has friction.
     """
 
     name: str
@@ -46,12 +46,12 @@ class JointTrack:
     v: Array
     tau: Array
     target: Array
-    rubs: bool
+    has_friction: bool
 
     @property
     def stuck(self) -> Array:
         """Positions at samples at which friction holds the joint, NaN at other samples, N values."""
-        rests = np.pad((self.v == 0.0) & self.rubs, 1) if self.v.size else np.zeros(len(self.q) + 2, bool)
+        rests = np.pad((self.v == 0.0) & self.has_friction, 1) if self.v.size else np.zeros(len(self.q) + 2, bool)
         return np.where(rests[1:-1] & (rests[:-2] | rests[2:]), self.q, np.nan)
 
     @property
@@ -226,8 +226,8 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
         )
         if effort is not None and first.get("limit_effort"):  # commands may exceed it; a bag's efforts do not
             tau = np.clip(tau, -effort, effort)
-        rubs = bool(first.get(f"friction[{i + 1}]"))
-        joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target, rubs))
+        has_friction = bool(first.get(f"friction[{i + 1}]"))
+        joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target, has_friction))
     return tuple(joints)
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..export.closed_form import Array
-from .panels import CURVE, THIN, Looks
+from .panels import CURVE, THIN, LineStyles
 from .strokes import ALARM, GREY, INK, PALE, SMALLEST_RANGE, Stroke, downsampled
 from .track import Task, Track
 
@@ -39,9 +39,9 @@ def workspace_title(tracks: Sequence[Track]) -> str:
     return f"Path of {', '.join(frames)}"
 
 
-def views(tracks: Sequence[Track], looks: Looks) -> list[View]:
+def views(tracks: Sequence[Track], line_styles: LineStyles) -> list[View]:
     """Return one view for planar motion, else a top view and a side view; none without a robot."""
-    return [_view(plane, tracks, looks) for plane in _planes(tracks)]
+    return [_view(plane, tracks, line_styles) for plane in _planes(tracks)]
 
 
 def _planes(tracks: Sequence[Track]) -> list[tuple[int, int]]:
@@ -57,8 +57,8 @@ def _planes(tracks: Sequence[Track]) -> list[tuple[int, int]]:
     return [(0, 1), (int(extent[1] > extent[0]), 2)]
 
 
-def _view(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> View:
-    strokes = [*_arms(plane, tracks, looks), *_paths(plane, tracks, looks), *_circles(plane, tracks)]
+def _view(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyles) -> View:
+    strokes = [*_arms(plane, tracks, line_styles), *_paths(plane, tracks, line_styles), *_circles(plane, tracks)]
     limits = []
     for values in ("x", "y"):
         seen = np.concatenate([getattr(stroke, values) for stroke in strokes if stroke.framed])
@@ -68,11 +68,11 @@ def _view(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> View
     return View("".join("xyz"[axis] for axis in plane), tuple(strokes), *limits)
 
 
-def _stroke(label: str, track: int | None, points: Array, *look: Any, **more: Any) -> Stroke:
-    return Stroke(label, track, *points.T, *look, **more)
+def _stroke(label: str, track: int | None, points: Array, *line: Any, **more: Any) -> Stroke:
+    return Stroke(label, track, *points.T, *line, **more)
 
 
-def _arms(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Iterator[Stroke]:
+def _arms(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyles) -> Iterator[Stroke]:
     """Return the arms at the start, with equal ones drawn once, and at the end.
 
     Arms at the end have decreasing widths, so that all arms with the same end are visible.
@@ -88,15 +88,15 @@ def _arms(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Iter
             label, owner = "arm at the start", i if alone else None
             yield _stroke(label, owner, start[:, plane], PALE, 3.5, mark="o", depth=2.5)
         width = 3.5 if alone else 5.0 - 3.5 * i / (len(tracks) - 1)
-        colour = GREY if alone else looks[i, ""].colour
+        colour = GREY if alone else line_styles[i, ""].colour
         yield _stroke("arm at the end", i, end[:, plane], colour, width, mark="o", depth=3.0)
 
 
-def _paths(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Iterator[Stroke]:
+def _paths(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyles) -> Iterator[Stroke]:
     for i, track in enumerate(tracks):
         if track.motion is not None:
-            path, look = _drawable(track.motion.path[:, plane]), looks[i, ""]
-            yield _stroke("path", i, path, look.colour, CURVE, look.dashes)
+            path, line = _drawable(track.motion.path[:, plane]), line_styles[i, ""]
+            yield _stroke("path", i, path, line.colour, CURVE, line.dashes)
         if track.task:
             yield _target(plane, i, track.task)
         for cause in track.verdict.causes if track.motion is not None else ():
