@@ -227,6 +227,19 @@ def best_of(folder: str, cost: str, capsys: pytest.CaptureFixture[str]) -> list[
     return best
 
 
+@pytest.mark.parametrize("cost", ["turn_error", "peak_effort/0"])
+def test_a_cost_that_no_run_has_ranks_none(
+    cost: str, native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = str(tmp_path / "s")
+    grid = ["--grid", "Kp=20:40:2", "--stop-time", "0.1"]
+    assert main(["sweep", str(native_path), *grid, "-o", folder, "--cost", cost]) == 0
+    said = f"\nno run is best: the cost '{cost}' is not a finite number for any of them\n"
+    assert said in capsys.readouterr().out
+    assert main(["info", folder, "--cost", cost]) == 0
+    assert said in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("cost", "said"),
     [
@@ -234,6 +247,7 @@ def best_of(folder: str, cost: str, capsys: pytest.CaptureFixture[str]) -> list[
         ("settling > 1", "is not a value, as 'settling + 0.1*peak_effort'"),
         ("peak", "there is no number 'peak'; did you mean peak_effort or peak_velocity?"),
         ("__import__('os')", "is not a value"),
+        ("1/0", "'1/0' has no number of a run; there are: settling_time, overshoot, "),
     ],
 )
 def test_a_cost_is_refused_before_the_sweep(

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterable
 from functools import partial
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -162,8 +162,11 @@ def print_best(table: DataFrame, cost: Expression | None = None) -> None:
     title = f"best: {', '.join(ranks)}" if ranks else "finished; no metric ranks them"
     if cost is not None:
         title = f"best: least cost, {cost.text}"
-    if (ranks or cost) and (count := equals(ranked(table, cost), cost)) > 1:
+    runs = ranked(table, cost)
+    if (ranks or cost) and (count := equals(runs, cost)) > 1:
         title = f"no single best run: {count} are equal up to rounding"
+    if cost is not None and rows and not runs["cost"].abs().lt(inf).any():
+        title = f"no run is best: the cost '{cost.text}' is not a finite number for any of them"
     say(f"\n{title}" if rows else "\nno run was finished")
     if text := remark(table):
         say(f"note: {text}")

@@ -67,6 +67,8 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
     except (ValueError, SyntaxError, OverflowError, RecursionError, MemoryError):
         like = "a comparison, as 'error > 1e-3'" if condition else "a value, as 'settling + 0.1*peak_effort'"
         raise InputError(f"'{text:.100}' is not {like}") from None
+    if not names:
+        raise InputError(f"'{text:.100}' has no number of a run; there are: {', '.join(known)}")
     for name in names:
         if not full_name(name, known):
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
