@@ -187,6 +187,40 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
         lambda: twodof.FmuOptions(lock=["joint1"]),  # type: ignore[arg-type]
         r"`lock` is \['joint1'\]; give positions by joint, as \{'joint1': 0.0\}",
     ),
+    "an input as a keyword": (
+        lambda: twodof.run("arm.fmu", x_des=(0.2, 0.1)),  # type: ignore[call-arg]
+        r"no argument 'x_des'; inputs and parameters are settings=\{'x_des': …\}",
+    ),
+    "values by joint": (
+        lambda: twodof.run("arm.fmu", settings={"x_des": {"x": 0.2}}),
+        r"x_des is \{'x': 0.2\}; give its 2 values in a list",
+    ),
+    "a joint as a setting": (
+        lambda: twodof.run("arm.fmu", settings={"joint2": 0.3}),
+        "no variable 'joint2': it is a joint, number 2 of the elements",
+    ),
+    "changes by time": (
+        lambda: twodof.run("arm.fmu", changes={0.5: {"Kp": 80}}),  # type: ignore[arg-type]
+        r"`changes` is \{0.5: .* give times with their inputs, as \[\(0.5, \{'Kp': 80\}\)\]",
+    ),
+    "a text as a grid": (
+        lambda: twodof.sweep("arm.fmu", grid={"Kp": "50"}),  # type: ignore[dict-item]
+        "grid of Kp is '50'; give its values, as",
+    ),
+    "a grid of the command line": (
+        lambda: twodof.sweep("arm.fmu", grid={"Kp": "20:60:3"}),  # type: ignore[dict-item]
+        "grid of Kp is '20:60:3'; give its values, as",
+    ),
+    "a URDF as options": (
+        lambda: twodof.build_fmu("new.fmu", "robot.urdf"),  # type: ignore[arg-type]
+        r"options are 'robot.urdf'; give twodof.FmuOptions\(urdf=…\)",
+    ),
+    "options as a path": (
+        lambda: twodof.build_fmu(twodof.FmuOptions()),  # type: ignore[arg-type]
+        r"FmuOptions\(.* is no path; give the path of the FMU",
+    ),
+    "a figure of a number": (lambda: twodof.plot(3), "3 is no path; give the path of the bag"),  # type: ignore[arg-type]
+    "a name of another library": (lambda: twodof.load_bag, "no attribute 'load_bag'; did you mean 'read_bag'"),  # type: ignore[attr-defined]
 }
 
 
@@ -194,5 +228,5 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
 def test_a_mistake_in_python_gets_its_remedy(mistake: str, things: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(things)
     call, words = CALLS[mistake]
-    with pytest.raises((twodof.TwoDofError, TypeError), match=words):
+    with pytest.raises((twodof.TwoDofError, TypeError, AttributeError), match=words):
         call()

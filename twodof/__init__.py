@@ -38,7 +38,9 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        from .errors import choice
+
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'{choice(name, __all__)}")
     import importlib
 
     from .errors import TwoDofError

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from difflib import get_close_matches
 from itertools import islice
-from os import scandir
+from os import PathLike, scandir
 from pathlib import Path
 
 MOST_NEIGHBOURS = 1000  # files of a folder among which the nearest name is searched
@@ -126,6 +126,17 @@ def kind_of(path: Path) -> str:
     if ".parquet" in suffixes:
         return "sweep"
     return "bag" if suffixes & {".mcap", ".db3"} or (path / "metadata.yaml").exists() else "folder"
+
+
+def path_of(value: object, wanted: str) -> Path:
+    """Return the path of a file or folder.
+
+    Raises:
+        TypeError: the value is no path; the message names what it is the path of.
+    """
+    if not isinstance(value, str | PathLike):
+        raise TypeError(f"{value!r:.50} is no path; give the path of the {wanted}")
+    return Path(value)
 
 
 def no_such(wanted: str, path: Path) -> str:

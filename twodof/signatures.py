@@ -61,4 +61,6 @@ def _check_keywords(given: Iterable[str], called: Callable[..., object]) -> None
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean '{near[0]}'? " if near else ""
+            if not near and "settings" in known:
+                remedy = f"inputs and parameters are settings={{'{name}': …}}. "
             raise TypeError(f"{called.__name__}() has no argument '{name}'; {remedy}It takes {', '.join(known)}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import BagError
+from ..errors import BagError, path_of
 from ..files import refusing, temporary_folder, write_file
 from ..plant.urdf import RobotError, read_urdf
 from ..version import install
@@ -33,7 +33,7 @@ def export_bag(bag: str | Path, output: str | Path) -> Path:
         BagError: the bag is incomplete, the suffix is unknown, pandas or pyarrow is missing, or the file cannot be
             written.
     """
-    bag, path = Path(bag), Path(output)
+    bag, path = path_of(bag, "bag"), path_of(output, "export")
     if path.suffix not in ENDINGS:
         raise BagError(f"'{path}': the name of an export ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
     if path.suffix == ".mcap":

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BagError, no_such
+from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
@@ -39,7 +39,7 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: the path is no bag, or the bag is unfinished, damaged or without joint states.
     """
-    return _read(Path(path), _JointStates, _Targets())
+    return _read(path_of(path, "bag"), _JointStates, _Targets())
 
 
 def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:

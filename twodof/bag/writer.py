@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from pathlib import Path
 
-from ..errors import BagError
+from ..errors import BagError, path_of
 from ..files import sync
 from ..fmu import read_resource
 from ..ros.cdr import Rows
@@ -65,7 +65,7 @@ class Bag(Sink):
         compress: str = "",
         command_line: str = "",
     ) -> None:
-        self.path, self.namespace = Path(path), ""
+        self.path, self.namespace = path_of(path, "bag"), ""
         self._store = Store(self.path, storage, overwrite=overwrite, fsync=fsync, compress=compress)
         self._scene, self._meshes, self._effort, self._measured = scene or meshes, meshes, effort, measured
         self._command_line = command_line

@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from ..errors import ZIP_ERRORS, BuildError
+from ..errors import ZIP_ERRORS, BuildError, path_of
 from ..files import check_archive, data_file, descriptor_of, refusing, write_file
 from ..plant.urdf import RobotError
 from ..version import versions
@@ -42,10 +42,12 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
             the output; the message names it.
     """
     options = options or FmuOptions()
+    if not isinstance(options, FmuOptions):
+        raise BuildError(f"the options are {options!r:.50}; give twodof.FmuOptions(urdf=…)")
     if options.part == "split":
         return _build_system(output, options, overwrite=overwrite)
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
-    path = Path(output if output is not None else default)
+    path = path_of(default if output is None else output, "FMU")
     comment = DEFAULT_ARM if options.is_default_arm else b""
     made_of = options.native and options.urdf is None
     if made_of:

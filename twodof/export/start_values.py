@@ -75,6 +75,8 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
             raise InputError(no_variable(fmu, name, "input", "parameter"))
         # arrays have their own types of numbers
         plain: object = setting.tolist() if hasattr(setting, "tolist") else setting
+        if isinstance(plain, Mapping):
+            raise InputError(f"{name} is {plain!r:.50}; give its {len(elements)} values in a list")
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
         if len(given) != len(elements):
             raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
@@ -115,6 +117,8 @@ def _of_another(fmu: Variables, name: str) -> str:
     elements = vector(fmu.variables, group)
     if elements and fmu.variables[elements[0]].causality in ("input", "parameter"):
         return f": {group} has {len(elements)} elements"
+    if name in (joints := getattr(fmu, "joints", ())):
+        return f": it is a joint, number {joints.index(name) + 1} of the elements of a vector"
     if not fmu.control or not having:
         return ""
     quoted = " or ".join(f"control '{control}'" for control in having)

@@ -17,7 +17,7 @@ import fmpy
 from fmpy.model_description import ModelDescription, ModelVariable, ValidationError
 
 from ..bounds import MAX_RESOURCE
-from ..errors import ZIP_ERRORS, FmuError
+from ..errors import ZIP_ERRORS, FmuError, path_of
 from ..export.compiler import host_platform
 from ..export.icon import side_view
 from ..export.start_values import groups_of, vector
@@ -178,7 +178,8 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
         FmuError: the file is missing, is no zip archive, is unsafe to unzip, or is no co-simulation FMU of FMI 2.0 or
             3.0.
     """
-    path, where = Path(path), Path(path, inside)
+    path = path_of(path, "FMU")
+    where = path / inside
     xml, members = read_archive(path, inside)
     try:
         root = ET.fromstring(xml)

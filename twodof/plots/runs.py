@@ -14,6 +14,7 @@ from pathlib import Path
 
 from ..bag.provenance import each_robot
 from ..bag.recording import Recording
+from ..errors import path_of
 from .figure import Drawing, draw_head, drawn
 from .interactive import body
 from .panels import HELD, KINDS, TARGET, UNITS, Panel, duration, joint_names, panels_of, title
@@ -57,7 +58,7 @@ def plot(*bags: Recording | str | Path, urdf: str | Path | None = None, frame: s
 
 def each_of(bags: Sequence[Recording | str | Path]) -> list[Recording | Path]:
     """Return the bags; a bag of several robots is replaced by its robots."""
-    parts = ([bag] if isinstance(bag, Recording) else each_robot(Path(bag)) for bag in bags)
+    parts = ([bag] if isinstance(bag, Recording) else each_robot(path_of(bag, "bag")) for bag in bags)
     return [part for several in parts for part in several]
 
 

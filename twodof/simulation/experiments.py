@@ -117,7 +117,13 @@ def experiment(
     if stop_time is None:
         stop_time = start_time + default(fmu, "stopTime", 5.0) - default(fmu, "startTime", 0.0)
     given = resolve(fmu, settings or {})
-    due = deque((t, _inputs_at(fmu, t, asked)) for t, asked in changes or [])
+    try:
+        asked = [(float(t), inputs) for t, inputs in changes or []]
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"`changes` is {changes!r:.50}; give times with their inputs, as [(0.5, {{'Kp': 80}})]"
+        ) from error
+    due = deque((t, _inputs_at(fmu, t, inputs)) for t, inputs in asked)
     if not all(earlier <= t < inf for (earlier, _), (t, _) in pairwise([(-inf, {}), *due])):
         raise InputError("the times of `changes` are finite and ascend")
     given = {**pop_until(math.nextafter(start_time, -inf), due), **given}

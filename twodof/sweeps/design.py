@@ -63,8 +63,10 @@ def make_design(
     grids, limits = {}, {}
     for name, values in grid.items():
         try:
+            if isinstance(values, str):  # its characters would be the values
+                raise TypeError
             grids[name] = tuple(map(float, values))
-        except TypeError as error:
+        except (TypeError, ValueError) as error:
             raise InputError(f"the grid of {name} is {values!r:.50}; give its values, as [20, 50, 80]") from error
     for name, pair in ranges.items():
         try:
