@@ -49,6 +49,7 @@ LIBRARIES = {
     "libcosimpy": {"fmu"},
     "foxglove": {"pages"},
     "lz4": {"bag"},
+    "IPython": {"notebook"},
     "imageio_ffmpeg": {"plots"},
     "matplotlib": {"plots"},
     "pandas": {"sweeps", "bag", "plots", "pages", "cli"},  # tables: made, of a recording, drawn, shown, printed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 import shutil
@@ -77,6 +78,28 @@ def test_a_notebook_shows_bars_of_what_takes_long(
     assert shown or told == ["", "", ""]
     script = subprocess.run([sys.executable, "-c", "\n".join((begin, run, sweep))], cwd=tmp_path, capture_output=True)
     assert (script.returncode, script.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(("tick", "shown"), [(0.05, True), (1e6, False)])
+def test_a_notebook_shows_a_line_of_a_slow_build(tmp_path: Path, tick: float, shown: bool) -> None:
+    """Each text of the line, and the cell's output once the build is done; a script shows none."""
+    begin = f"import os, twodof\nfrom twodof import notebook\nnotebook.TICK = {tick}"
+    begin += "\nos.environ.pop('TQDM_DISABLE', None);"
+    watch = """from IPython.display import DisplayHandle
+seen = []
+def watched(method):
+    return lambda self, data, **options: (seen.append(data["text/plain"]), method(self, data, **options))
+DisplayHandle.display, DisplayHandle.update = watched(DisplayHandle.display), watched(DisplayHandle.update)"""
+    build = "twodof.build_fmu('new.fmu');"
+    done = executed(notebook_of((f"{begin}\n{watch}", build, "print(seen)")), tmp_path)
+    assert [output["data"]["text/plain"] for output in done.cells[1].outputs] == [""] * shown
+    seen = ast.literal_eval(done.cells[2].outputs[0]["text"])
+    assert seen[-1:] == [""] * shown and all(re.fullmatch(r"building an FMU: \d+ s", text) for text in seen[:-1])
+    assert len(seen) > 2 or not shown
+    script = subprocess.run(
+        [sys.executable, "-c", f"{begin}\n{build.replace('new', 'other')}"], cwd=tmp_path, capture_output=True
+    )
+    assert (script.returncode, script.stdout, script.stderr) == (0, b"", b"")
 
 
 def test_a_cell_that_fails_is_an_error(tmp_path: Path) -> None:

@@ -1,7 +1,14 @@
-"""HTML of results for notebooks: a table of facts and a small SVG picture, without scripts."""
+"""HTML of results for notebooks: a table of facts and a small SVG picture, without scripts. Lines of slow tasks."""
 
-from collections.abc import Iterable, Mapping
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import copy_context
 from html import escape
+from threading import Event, Thread
+from time import perf_counter
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +19,40 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 WIDTH, HEIGHT, EDGE = 320.0, 160.0, 18.0  # px; the edge holds the labels
 SMALLEST_RANGE = 1e-9  # smaller ranges are drawn as one value
 MOST_PARTS = 300  # about one part for each pixel
+TICK = 1.0  # s until a slow task has a line, and between its updates
+
+
+def in_notebook() -> bool:
+    """Return whether a notebook shows progress: its kernel runs this process, and TQDM_DISABLE is not set."""
+    return "ipykernel.zmqshell" in sys.modules and not os.environ.get("TQDM_DISABLE")
+
+
+@contextmanager
+def busy(what: str) -> Iterator[None]:
+    """Show the name of a slow task and its duration in a notebook; elsewhere do nothing."""
+    if not in_notebook():
+        yield
+        return
+    from IPython import display
+
+    done, begin = Event(), perf_counter()
+    line = cast(Any, display).DisplayHandle()
+
+    def show() -> None:
+        tell = line.display
+        while not done.wait(TICK):
+            tell({"text/plain": f"{what}: {perf_counter() - begin:.0f} s"}, raw=True)
+            tell = line.update
+        if tell == line.update:
+            tell({"text/plain": ""}, raw=True)
+
+    thread = Thread(target=copy_context().run, args=(show,))  # the context has the cell
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 def card(title: str, facts: Mapping[str, object], picture: str = "") -> str:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from ..errors import BuildError
 from ..files import data_file, temporary_folder, write_file
+from ..notebook import busy
 
 LOG = logging.getLogger(__name__)
 TARGETS: dict[str, tuple[str, ...]] = {
@@ -103,6 +104,7 @@ def compile_library(
     return built[0] if len(built) == 1 else universal(built)
 
 
+@busy("compiling for the browser")
 def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str]) -> bytes:
     """Compile C files to a WebAssembly module without imports; attributes in the files name its exports.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError, path_of
 from ..files import check_archive, data_file, descriptor_of, refusing, write_file
+from ..notebook import busy
 from ..plant.urdf import RobotError
 from ..version import versions
 from .compiler import compiles_for_the_web, host_platform
@@ -24,6 +25,7 @@ DEFAULT_ARM = b"twodof: the default arm"
 """Beginning of the zip comment of the default arm's FMUs, in any flavour and version."""
 
 
+@busy("building an FMU")
 def build_fmu(output: str | Path | None = None, options: FmuOptions | None = None, *, overwrite: bool = False) -> Path:
     """Build an FMU.
 

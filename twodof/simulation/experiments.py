@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import pairwise
@@ -117,15 +117,7 @@ def experiment(
     if stop_time is None:
         stop_time = start_time + default(fmu, "stopTime", 5.0) - default(fmu, "startTime", 0.0)
     given = resolve(fmu, settings or {})
-    try:
-        asked = [(float(t), inputs) for t, inputs in changes or []]
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"`changes` is {changes!r:.50}; give times with their inputs, as [(0.5, {{'Kp': 80}})]"
-        ) from error
-    due = deque((t, _inputs_at(fmu, t, inputs)) for t, inputs in asked)
-    if not all(earlier <= t < inf for (earlier, _), (t, _) in pairwise([(-inf, {}), *due])):
-        raise InputError("the times of `changes` are finite and ascend")
+    due = _due(fmu, changes or [])
     given = {**pop_until(math.nextafter(start_time, -inf), due), **given}
     if input_file is not None:
         if changes is not None:
@@ -172,6 +164,18 @@ def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str,
     while due and due[0][0] <= t:
         values |= due.popleft()[1]
     return values
+
+
+def _due(fmu: Fmu, changes: Iterable[tuple[float, Mapping[str, Setting]]]) -> deque[tuple[float, dict[str, Value]]]:
+    """Return the checked changes of inputs over time."""
+    try:
+        asked = [(float(t), inputs) for t, inputs in changes]
+    except (TypeError, ValueError) as error:
+        reason = f"`changes` is {changes!r:.50}; give times with their inputs, as [(0.5, {{'Kp': 80}})]"
+        raise InputError(reason) from error
+    if not all(earlier <= t < inf for (earlier, _), (t, _) in pairwise([(-inf, {}), *asked])):
+        raise InputError("the times of `changes` are finite and ascend")
+    return deque((t, _inputs_at(fmu, t, inputs)) for t, inputs in asked)
 
 
 def _inputs_at(fmu: Fmu, t: float, asked: Mapping[str, Setting]) -> dict[str, Value]:

@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import InputError, SimulationError, diverged, step_failure
 from ..fmu import Fmu, Instance, SystemInstance, instantiate
+from ..notebook import in_notebook
 from ..plant.urdf import Urdf
 from ..signatures import ignore, never, with_keywords_of
 from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
 from .input_values import Setting, Value, resolve
 from .judge import BLOCK, OUTPUTS, Judge
 from .pace import RealTime
-from .progress import Progress, in_notebook
+from .progress import Progress
 from .run_summary import Summary
 from .sample import Sample, Sink
 from .setup import robot_of, setup_of

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
+from ..notebook import in_notebook
 from .sample import Sample, Sink
 
 if TYPE_CHECKING:
@@ -16,11 +15,6 @@ if TYPE_CHECKING:
 
 SILENCE = 1.0  # s until a notebook shows a bar
 BAR = "{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left"
-
-
-def in_notebook() -> bool:
-    """Return whether a notebook shows bars: its kernel runs this process, and TQDM_DISABLE is not set."""
-    return "ipykernel.zmqshell" in sys.modules and not os.environ.get("TQDM_DISABLE")
 
 
 def _bar(what: str, unit: str, **options: Any) -> Any:

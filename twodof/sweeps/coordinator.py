@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from ..files import temporary_folder
 from ..fmu import Fmu, opened
+from ..notebook import in_notebook
 from ..signatures import never
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
-from ..simulation.progress import counting, in_notebook
+from ..simulation.progress import counting
 from ..version import versions
 from .batches import Batches
 from .design import Design, make_design
