@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.request import urlopen
 
 import numpy as np
 import oracles
@@ -504,22 +505,37 @@ def test_library_of_colours_is_not_read_with_a_mesh(tmp_path: Path) -> None:
     assert subprocess.check_output(command, text=True, timeout=60) == "1\n"
 
 
+def description_in(bag: Path) -> str:
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/robot_description"])
+        ((_, _, _, message),) = decoded
+    return str(message.data)
+
+
+def test_meshes_of_a_scene_are_opened_by_their_uris(native_path: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "a b#1%20ü?"
+    twodof.simulate(native_path, twodof.Bag(bag, meshes=True), stop_time=0.02)
+    names = [str(mesh.get("filename")) for mesh in ET.fromstring(description_in(bag)).iter("mesh")]
+    assert len(names) >= 2
+    for name in names:
+        with urlopen(name) as content:
+            assert content.read() == (bag / "meshes" / Path(name).name).read_bytes()
+
+
 def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path: Path) -> None:
     """By Pinocchio's reader of URDF and meshes, from the description in the bag and the files that it names."""
     fmu = twodof.build_fmu(tmp_path / "panda.fmu", twodof.stock_robot("panda"))
-    twodof.simulate(fmu, twodof.Bag(tmp_path / "bag", meshes=True), stop_time=0.02)
-    with (tmp_path / "bag/bag.mcap").open("rb") as file:
-        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/robot_description"])
-        ((_, _, _, message),) = decoded
+    twodof.simulate(fmu, twodof.Bag(tmp_path / "Müller", meshes=True), stop_time=0.02)
+    description = description_in(tmp_path / "Müller")
     source = stock_robots()["panda"]
     truth = pin.buildGeomFromUrdf(
         pin.buildModelFromUrdf(str(source)), str(source), pin.GeometryType.VISUAL, package_dirs=str(source.parents[4])
     )
-    model = pin.buildModelFromXML(message.data)
-    found = pin.buildGeomFromUrdfString(model, message.data, pin.GeometryType.VISUAL)
+    model = pin.buildModelFromXML(description)
+    found = pin.buildGeomFromUrdfString(model, description, pin.GeometryType.VISUAL)
     assert len(found.geometryObjects) == len(truth.geometryObjects) >= 10
     for shown, wanted in zip(found.geometryObjects, truth.geometryObjects):
-        assert shown.name == wanted.name and shown.meshPath.startswith(str(tmp_path / "bag/meshes"))
+        assert shown.name == wanted.name and shown.meshPath.startswith(str(tmp_path / "Müller/meshes"))
         np.testing.assert_allclose(shown.placement.homogeneous, wanted.placement.homogeneous, rtol=0.0, atol=1e-9)
         corners = [geometry.geometry.vertices() for geometry in (shown, wanted)]
         assert corners[0].size >= 954

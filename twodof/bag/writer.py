@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable, Mapping
 from copy import copy
 from pathlib import Path
+from urllib.parse import quote
 
 from ..errors import BagError, path_of
 from ..files import sync
@@ -101,7 +103,9 @@ class Bag(Sink):
         """
         self._run = run
         self._inputs = run.start_values
-        folder = f"{self._folder.as_uri()}/" if self._meshes else ""
+        # letters beyond ASCII stay: rerun and Pinocchio do not decode names, and RViz and Foxglove take both
+        name = re.sub(r"[^\w/.~-]", lambda character: quote(character[0]), f"{self._folder}/")
+        folder = f"file://{name}" if self._meshes else ""
         self._messages = Messages(
             run, scene=self._scene, effort=self._effort, meshes_in=folder, measured=self._measured
         )
