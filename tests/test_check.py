@@ -162,7 +162,10 @@ def test_a_description_with_problems_fails(tmp_path: Path) -> None:
     check = twodof.check(foreign(tmp_path, description=described))
     assert failed(check) == {"description": 'The unit "furlong" of variable "der(x)" (line 9) is not defined.'}
     check = twodof.check(foreign(tmp_path, description=DESCRIPTION.replace("<ModelStructure>", "<Structure>")))
-    assert [row.outcome for row in check.rows] == ["failed"]
+    outcomes = {row.name: (row.outcome, row.text) for row in check.rows}
+    assert outcomes.pop("description")[0] == "failed"
+    assert {*outcomes} == {*TRIALS}
+    assert {*outcomes.values()} == {("does not apply", "it was not run, because its description cannot be read")}
 
 
 def test_an_fmu_for_another_machine_is_not_run(tmp_path: Path) -> None:

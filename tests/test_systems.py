@@ -82,6 +82,13 @@ def binding(content: str = "", mapping: str = "", attributes: str = "") -> str:
     )
 
 
+def mapping(*rows: str) -> str:
+    """Return the XML of an inline parameter mapping, of rows "source target"."""
+    entries = "".join('<ssm:MappingEntry source="{}" target="{}"/>'.format(*row.split()) for row in rows)
+    inner = f'<ssm:ParameterMapping {NAMESPACES} version="1.0">{entries}</ssm:ParameterMapping>'
+    return f"<ssd:ParameterMapping>{inner}</ssd:ParameterMapping>"
+
+
 GIVEN = values("q_des[1] Real 0.3", "q_des[2] Real 0.2", "Kp Real 0.1", "Kd Real 0.01")
 
 
@@ -111,6 +118,45 @@ def test_units_are_converted_and_not_where_that_is_suppressed(plant: bytes, tmp_
     system = loop(tmp_path / "loop.ssp", plant, degrees, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
     plain = by_hand(plant, tmp_path / "plant.fmu")
     np.testing.assert_array_equal(q_of(system, **{**settings, "pd__q_des": TARGET}), plain)
+
+
+def test_a_connector_may_repeat_the_unit_of_its_variable(plant: bytes, tmp_path: Path) -> None:
+    """In few digits, under another name, or without a definition; values have the unit of the FMU's variable."""
+    rounded = '<ssc:Unit name="degree"><ssc:BaseUnit rad="1" factor="0.0174533"/></ssc:Unit>'
+    settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
+    degrees, plain = pd_fmu(unit="deg", factor=np.pi / 180.0), ssd(f"{BOTH}<ssd:Connections>{WIRES}</ssd:Connections>")
+    expected = q_of(loop(tmp_path / "plain.ssp", plant, degrees, plain), **settings)
+    for unit in ("degree", "deg", "undefined"):
+        own = component("pd", connectors({f"q[{i}]": f"input {unit}" for i in (1, 2)}))
+        both = BOTH.replace(component("pd"), own)
+        text = ssd(f"{both}<ssd:Connections>{WIRES}</ssd:Connections>", f"<ssd:Units>{DEGREE}{rounded}</ssd:Units>")
+        np.testing.assert_array_equal(q_of(loop(tmp_path / f"{unit}.ssp", plant, degrees, text), **settings), expected)
+
+
+def test_what_is_probably_not_meant_gets_a_line(
+    plant: bytes, pd: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A vector that is connected in part; a bare setting of the plant that the other FMU has too."""
+    system = loop(tmp_path / "loop.ssp", plant, pd)
+    twodof.experiment(system, settings=GAINS)
+    assert not caplog.records
+    part = WIRES.replace(connection("plant.v[2]", "pd.v[2]"), "")
+    system = loop(tmp_path / "part.ssp", plant, pd, ssd(f"{BOTH}<ssd:Connections>{part}</ssd:Connections>"))
+    twodof.experiment(system)
+    line = "not all elements of an input are connected: pd.v[2] keep their values"
+    assert [record.getMessage() for record in caplog.records] == [f"'{system}': {line}"]
+    assert line in str(twodof.check(system).rows[0])
+    assert main(["info", str(system)]) == 0 and line in capsys.readouterr().out
+    caplog.clear()
+    elements = component("plant") + component("plant").replace('name="plant"', 'name="left"')
+    two = loop(tmp_path / "two.ssp", plant, pd, ssd(f"<ssd:Elements>{elements}</ssd:Elements>"))
+    fmu = twodof.load_fmu(two, "plant")
+    twodof.experiment(fmu, settings={"plant.control_period": 0.02})
+    twodof.experiment(fmu, settings={"control_period": 0.02, "left.control_period": 0.02})
+    assert not caplog.records
+    twodof.experiment(fmu, settings={"control_period": 0.02})
+    line = "control_period is set in 'plant' alone: left.control_period keeps its value"
+    assert [record.getMessage() for record in caplog.records] == [f"'{two}': {line}"]
 
 
 def nested(plant: bytes, pd: bytes, path: Path, factor: float = 2.0) -> Path:
@@ -293,6 +339,20 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     deep = '<ssd:System name="s"><ssd:Elements>' * 500 + "</ssd:Elements></ssd:System>" * 500
     yield "deep", ssd(f"<ssd:Elements>{deep}</ssd:Elements>"), {}, "is not valid SSP 1.0"
     yield "slip", None, {"../out": b""}, "leaves its folder"
+    units = f"<ssd:Units>{DEGREE}<ssc:Unit name='turn'><ssc:BaseUnit/></ssc:Unit></ssd:Units>"
+    for kind, text, message in (
+        ("<ssc:Real{}/>", "input deg", r"'pd\.q\[1\]' states the unit 'deg', and its FMU another, 'rad'"),
+        ("<ssc:Real{}/>", "input turn", r"'pd\.q\[1\]' states the unit 'turn', and its FMU another, 'rad'"),
+        ("<ssc:Integer/>", "input", r"'pd\.q\[1\]' states the type Integer, and its FMU Real"),
+    ):
+        parts = wired.replace(component("pd"), component("pd", connectors({"q[1]": text}, kind)))
+        yield f"connector {text} {kind[5:9]}", ssd(parts, units), {}, message
+    for name, inner in (
+        ("set", binding(values("Kp Real 1", "Kd Real 2", "Kp Real 3"))),
+        ("map", binding(values("a Real 1", "b Real 2"), mapping("a Kp", "b Kp"))),
+    ):
+        parts = wired.replace(component("pd"), component("pd", inner))
+        yield f"{name} twice", ssd(parts), {}, r"of 'pd' sets 'Kp' twice"
     yield "no FMU", None, {"resources/pd.fmu": b"PK no zip"}, "resources/pd.fmu' is no FMU"
     slip = zipped({"modelDescription.xml": b"<a/>", "../out": b""})
     yield "FMU slips", None, {"resources/pd.fmu": slip}, "leaves its folder"

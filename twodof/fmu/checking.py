@@ -95,7 +95,8 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
     names = {element.source: element.name for element in reversed(elements)}
     try:
         system = load_system(path)
-        first = Row("structure", "passed", f"{len(system.components)} components, {len(system.links)} connections")
+        text, remarks = f"{len(system.components)} components, {len(system.links)} connections", system.remarks()
+        first = Row("structure", "remark" if remarks else "passed", "; ".join([text, *remarks]))
     except FmuError as error:
         first = Row("structure", "remark", f"'twodof run' refuses it: {error}")
     rows = ((name, row) for source, name in names.items() for row in _rows(path, source, ()))
@@ -110,7 +111,9 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
     except FmuError as error:
         if not problems:
             raise
-        yield Row("description", "failed", "; ".join(problems) or str(error))
+        yield Row("description", "failed", "; ".join(problems))
+        reason = "it was not run, because its description cannot be read"
+        yield from (Row(name, "does not apply", reason) for name in TRIALS)
         return
     described = f"{len(known.variables)} variables, FMI {known.description.fmiVersion}"
     yield Row("description", *(("failed", "; ".join(problems)) if problems else ("passed", described)))

@@ -143,6 +143,10 @@ class Fmu:
         settable = (v for v in self.variables.values() if v.causality in ("input", "parameter"))
         return {v.name: v.start_value for v in settable if v.start_value is not None}
 
+    def remarks(self, asked: Iterable[str] = ()) -> list[str]:
+        """Return lines about a run with some settings; a system has them."""
+        return []
+
     def vector(self, group: str) -> list[str]:
         """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
         return vector(self.variables, self.aliases.get(group, group))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import posixpath
 import zipfile
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -77,10 +78,11 @@ class Parameter(NamedTuple):
 
 
 class Connector(NamedTuple):
-    """A connector of a system or component: its kind in SSP, and its unit, if stated."""
+    """A connector of a system or component: its kind in SSP, and its unit and type, if stated."""
 
     kind: str
-    unit: Unit
+    unit: Unit = Unit()
+    type: str = ""
 
 
 @dataclass
@@ -160,8 +162,9 @@ class _File:
         connectors = {}
         for connector in xml.iterfind(f"{SSD}Connectors/{SSD}Connector"):
             kind = next((child for child in connector if child.tag.startswith(SSC)), None)
-            unit = "" if kind is None else kind.get("unit", "")
-            connectors[connector.get("name", "")] = Connector(connector.get("kind", ""), units.get(unit, Unit(unit)))
+            unit, of = ("", "") if kind is None else (kind.get("unit", ""), kind.tag.removeprefix(SSC))
+            what = connector.get("kind", ""), units.get(unit, Unit(unit)), of
+            connectors[connector.get("name", "")] = Connector(*what)
         bindings = xml.iterfind(f"{SSD}ParameterBindings/{SSD}ParameterBinding")
         parameters = [parameter for binding in bindings for parameter in self._bound(binding, name)]
         element = Element(name, connectors, parameters)
@@ -195,8 +198,10 @@ class _File:
         """Yield the parameters of a binding."""
         root = self._content(binding, f"{SSD}ParameterValues", SSV, "ParameterValues", name)
         units, prefix = _units(root.find(f"{SSV}Units")), binding.get("prefix", "")
-        given = {}
-        for xml in root.iterfind(f"{SSV}Parameters/{SSV}Parameter"):
+        given: dict[str, Parameter] = {}
+        rows = root.findall(f"{SSV}Parameters/{SSV}Parameter")
+        self._check_once([xml.get("name", "") for xml in rows], f"a parameter set of '{name or 'the system'}' sets")
+        for xml in rows:
             kind = next(child for child in xml if child.tag.startswith(SSV))
             text, unit = kind.get("value", ""), kind.get("unit", "")
             of_kind = NUMBERS.get(kind.tag.removeprefix(SSV))
@@ -208,13 +213,20 @@ class _File:
             yield from given.values()
             return
         root = self._content(mapping, "", SSM, "ParameterMapping", name)
-        for entry in root.iterfind(f"{SSM}MappingEntry"):
+        entries = root.findall(f"{SSM}MappingEntry")
+        self._check_once([e.get("target", "") for e in entries], f"a mapping of '{name or 'the system'}' sets")
+        for entry in entries:
             source, target = entry.get("source", ""), entry.get("target", "")
             if prefix + source in given:
                 parameter = given[prefix + source]
                 converts = entry.get("suppressUnitConversion") not in TRUE
                 what = f"'{self._path}': the mapping of '{source}'"
                 yield parameter._replace(name=target, converts=converts, map=transformation(entry, what))
+
+    def _check_once(self, names: list[str], what: str) -> None:
+        """Refuse names that are not unique, as the standard demands of a parameter set and of the targets of a map."""
+        if twice := next((name for name, count in Counter(names).items() if count > 1), None):
+            raise FmuError(f"'{self._path}': {what} '{twice:.80}' twice; leave one value out")
 
     def _content(self, xml: ET.Element, inside: str, namespace: str, kind: str, name: str) -> ET.Element:
         """Return the root of a parameter set or mapping, which is inline or a file."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -60,6 +60,22 @@ class System(Fmu):
     def guid(self) -> str:
         """Digest of the structure and of the FMUs' digests."""
         return self.digest
+
+    def remarks(self, asked: Iterable[str] = ()) -> list[str]:
+        """Return lines about vectors that are connected in part, and settings that another FMU has too."""
+        ends, lines = {link.target for link in self.links}, []
+        for element, fmu in self.components.items():
+            for names in fmu.groups("input").values():
+                left = [f"{element}.{name}" for name in names if Node(element, name) not in ends]
+                if 0 < len(left) < len(names):
+                    lines.append(f"not all elements of an input are connected: {', '.join(left)} keep their values")
+        known = {*self.groups("parameter"), *self.groups("input")}
+        given = {name.partition("[")[0] for name in asked}
+        for group in sorted(given & known):
+            others = [full for name in self.components if (full := f"{name}.{group}") in known - given]
+            if others and self.places[self.vector(group)[0]].element == self.recorded:
+                lines.append(f"{group} is set in '{self.recorded}' alone: {', '.join(others)} keeps its value")
+        return lines
 
     @property
     def connections(self) -> list[str]:

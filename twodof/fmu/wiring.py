@@ -11,9 +11,11 @@ from xml.etree import ElementTree as ET
 from ..errors import FmuError, choice
 from .description import Fmu, Scalar
 from .ssp_file import EXPONENTS, IDENTITY, Affine, Connector, Element, Unit, transformation
-from .validation import TRUE
+from .validation import NUMBERS, TRUE
 
 SOURCES = ("output", "calculatedParameter")
+ROUNDING = 1e-5
+"""Relative difference of factors and offsets of one unit, which tools write with few digits."""
 
 
 class Node(NamedTuple):
@@ -47,6 +49,10 @@ class Wiring:
         self._path, self._fmus = path, fmus
         self.elements = {element.name: element for element in top.walk()}
         self._units = {name: _units_of(fmu) for name, fmu in fmus.items()}
+        for name, fmu in fmus.items():
+            for own, connector in self.elements[name].connectors.items():
+                if own in fmu.variables:
+                    self._check_connector(Node(name, own), connector, fmu.variables[own])
         self._incoming: dict[Node, tuple[Node, bool, Affine]] = {}
         for element in self.elements.values():
             for connection in element.connections:
@@ -74,13 +80,26 @@ class Wiring:
         return None
 
     def unit(self, node: Node) -> Unit:
-        """Return the unit of a connector, else that of its variable."""
-        stated = self.elements[node.element].connectors.get(node.connector, Connector("", Unit())).unit
+        """Return the unit of a variable, else that stated by its connector."""
+        stated = self.elements[node.element].connectors.get(node.connector, Connector("")).unit
         scalar = self.scalar(node)
-        own = (scalar.unit or "") if scalar is not None else ""
-        name = stated.name or own
-        known = self._units.get(node.element, {})
-        return stated if stated.exponents is not None else known.get(name, Unit(name))
+        own = self._own_unit(node, scalar) if scalar is not None else Unit()
+        return stated if not own.name or (own.exponents is None and own.name == stated.name) else own
+
+    def _own_unit(self, node: Node, scalar: Scalar) -> Unit:
+        return self._units[node.element].get(scalar.unit or "", Unit(scalar.unit or ""))
+
+    def _check_connector(self, node: Node, connector: Connector, scalar: Scalar) -> None:
+        """Refuse a connector that contradicts its variable in type or unit: its value has those of the variable."""
+        stated, own = connector.unit, self._own_unit(node, scalar)
+        what = f"'{self._path}': the connector '{node}' states"
+        if connector.type in NUMBERS and scalar.type in NUMBERS and connector.type != scalar.type:
+            raise FmuError(f"{what} the type {connector.type}, and its FMU {scalar.type}; state that of the FMU")
+        if stated.exponents is None or own.exponents is None:
+            return
+        alike = stated.exponents == own.exponents and math.isclose(stated.factor, own.factor, rel_tol=ROUNDING)
+        if not alike or not math.isclose(stated.offset, own.offset, rel_tol=ROUNDING):
+            raise FmuError(f"{what} the unit '{stated.name}', and its FMU another, '{own.name}'; state that of the FMU")
 
     def _kind(self, node: Node) -> str:
         scalar = self.scalar(node)

@@ -139,6 +139,8 @@ def experiment(
         changes=[*due],
         stamp_start=stamp_start,
     )
+    for line in fmu.remarks(settings or ()):
+        LOG.warning(f"'{fmu.path}': {line}")
     run.first_stamp()  # raises for a time that ROS 2 cannot express
     _report_late(run, "`changes`" if input_file is None else f"'{input_file}'")
     return run
