@@ -108,7 +108,7 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
     problems = problems_of(path, inside)
     try:
         known = load_any_fmu(path, inside)
-    except FmuError as error:
+    except FmuError:
         if not problems:
             raise
         yield Row("description", "failed", "; ".join(problems))

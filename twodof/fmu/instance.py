@@ -171,10 +171,12 @@ class Instance:
         """Return the number of values as an argument, if this version of FMI has this argument."""
         return ()
 
-    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
-        """Return a function that reads Real variables, always into the same buffer."""
+    def reader(self, names: Sequence[str], into: Values | None = None) -> Callable[[], Values]:
+        """Return a function that reads Real variables, always into the same buffer, which may be given."""
         distinct, columns, size = self._columns(names)
-        references, whole = (c_uint * len(distinct))(*distinct), (c_double * size)()
+        values = (c_double * len(columns))() if into is None else into
+        whole = values if columns == [*range(size)] else (c_double * size)()
+        references = (c_uint * len(distinct))(*distinct)
         asked = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
         get, arguments = self._get, (self._component, *asked)
 
@@ -184,9 +186,8 @@ class Instance:
                 self._refuse(status)
             return whole
 
-        if columns == [*range(size)]:
+        if whole is values:
             return read
-        values = (c_double * len(columns))()
 
         def read_elements() -> Values:
             read()
@@ -195,25 +196,29 @@ class Instance:
 
         return read_elements
 
-    def writer(self, names: Sequence[str]) -> Callable[[list[float]], None]:
-        """Return a function that sets Real variables; other elements of their vectors keep their last values."""
-        distinct, columns, size = self._columns(names)
-        references, whole = (c_uint * len(distinct))(*distinct), (c_double * size)()
-        given = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
-        put, arguments, in_order = self._put, (self._component, *given), columns == [*range(size)]
+    def writer(self, names: Sequence[str], values: Values) -> Callable[[], None]:
+        """Return a function that sets Real variables to the values in a buffer.
 
-        def write(values: list[float]) -> None:
+        Other elements of their vectors keep their last values.
+        """
+        distinct, columns, size = self._columns(names)
+        whole = values if columns == [*range(size)] else (c_double * size)()
+        references = (c_uint * len(distinct))(*distinct)
+        given = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
+        put, arguments = self._put, (self._component, *given)
+
+        def write() -> None:
             self._said = ""
-            if in_order:
-                whole[:] = [*values]
-            else:
-                whole[:] = [*chain(*(self._vectors["Real", reference] for reference in distinct))]
-                for column, value in zip(columns, values):
-                    whole[column] = value
             if (status := put(*arguments)) > WARNING:
                 self._refuse(status)
 
-        return write
+        def write_elements() -> None:
+            whole[:] = [*chain(*(self._vectors["Real", reference] for reference in distinct))]
+            for column, value in zip(columns, values):
+                whole[column] = value
+            write()
+
+        return write if whole is values else write_elements
 
     def value(self, name: str) -> float | bool:
         """Return the value of an Integer or Boolean variable."""

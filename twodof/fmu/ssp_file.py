@@ -163,8 +163,8 @@ class _File:
         for connector in xml.iterfind(f"{SSD}Connectors/{SSD}Connector"):
             kind = next((child for child in connector if child.tag.startswith(SSC)), None)
             unit, of = ("", "") if kind is None else (kind.get("unit", ""), kind.tag.removeprefix(SSC))
-            what = connector.get("kind", ""), units.get(unit, Unit(unit)), of
-            connectors[connector.get("name", "")] = Connector(*what)
+            facts = connector.get("kind", ""), units.get(unit, Unit(unit)), of
+            connectors[connector.get("name", "")] = Connector(*facts)
         bindings = xml.iterfind(f"{SSD}ParameterBindings/{SSD}ParameterBinding")
         parameters = [parameter for binding in bindings for parameter in self._bound(binding, name)]
         element = Element(name, connectors, parameters)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from ctypes import c_double, sizeof
 from functools import partial
 
 import fmpy
@@ -37,9 +38,11 @@ class SystemInstance:
         for link in system.links:
             if link.source.element not in instances:
                 self._outer.setdefault(link.source, []).append(link)
-        self._signals: list[float | bool] = []
-        self._places: dict[Node, int] = {}
+        self._signals = (c_double * max(1, sum(map(len, system.batches))))()  # values of connected Real outputs
+        self._columns: dict[Node, int] = {}
+        self._discrete: dict[Node, float | bool] = {}
         self._moves = [move for batch in system.batches for move in self._moves_of(batch)]
+        self._steps = [(name, instance.step) for name, instance in instances.items()]
         self._due = True
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
@@ -87,12 +90,7 @@ class SystemInstance:
         """Do one communication step of all FMUs from t to t + h."""
         if self._due:
             self._propagate()
-        name = ""
-        try:
-            for name in self._instances:
-                self._instances[name].step(t, h)
-        except SimulationError as error:
-            raise SimulationError(f"'{name}': {error}", outcome=error.outcome) from error
+        self._each(self._steps, t, h)
         self._propagate()
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
@@ -103,14 +101,18 @@ class SystemInstance:
 
     def _propagate(self) -> None:
         """Pass the outputs of this instant to the inputs."""
+        self._due = False
+        self._each(self._moves)
+
+    def _each(self, calls: Sequence[tuple[str, Callable[..., object]]], *arguments: float) -> None:
+        """Call functions in order; an error names the component."""
         name = ""
         try:
-            for move in self._moves:
-                name, pass_on = move
-                pass_on()
+            for each in calls:
+                name, call = each
+                call(*arguments)
         except SimulationError as error:
             raise SimulationError(f"'{name}': {error}", outcome=error.outcome) from error
-        self._due = False
 
     def _moves_of(self, batch: Sequence[Node]) -> Iterator[tuple[str, Callable[[], object]]]:
         """Yield components and functions that read a batch's outputs, or set inputs from earlier outputs."""
@@ -121,42 +123,39 @@ class SystemInstance:
             reals = [node for node in own if variables[node.connector].type == "Real"]
             sinks = [incoming[node] for node in reals if node in incoming]
             if sources := [node for node in reals if node not in incoming]:
-                yield element, self._read(instance.reader([node.connector for node in sources]), sources)
+                first = len(self._columns)
+                self._columns |= {node: first + i for i, node in enumerate(sources)}
+                yield element, instance.reader([node.connector for node in sources], self._part(first, len(sources)))
             if sinks:
-                yield element, self._write(instance.writer([link.target.connector for link in sinks]), sinks)
+                yield element, self._writer(instance, sorted(sinks, key=lambda link: self._columns[link.source]))
             for node in (node for node in own if node not in reals):
-                if node in incoming:
-                    yield element, partial(self._set_one, instance, node.connector, self._places[incoming[node].source])
-                else:
-                    self._places[node] = len(self._signals)
-                    self._signals.append(0)
-                    yield element, partial(self._read_one, instance, node.connector, self._places[node])
+                move = self._set_one if node in incoming else self._read_one
+                yield element, partial(move, instance, node, incoming[node].source if node in incoming else node)
 
-    def _read(self, read: Callable[[], Values], sources: Sequence[Node]) -> Callable[[], None]:
-        """Return a function that reads outputs into signals."""
-        first, last = len(self._signals), len(self._signals) + len(sources)
-        self._places |= {node: first + i for i, node in enumerate(sources)}
-        self._signals += [0.0] * len(sources)
-        signals = self._signals
+    def _part(self, first: int, size: int) -> Values:
+        """Return a part of the signals, with the same memory."""
+        return (c_double * size).from_buffer(self._signals, first * sizeof(c_double))
+
+    def _writer(self, instance: Instance, sinks: Sequence[Link]) -> Callable[[], None]:
+        """Return a function that sets inputs from signals; equal signals in order are not copied."""
+        names, columns = [link.target.connector for link in sinks], [self._columns[link.source] for link in sinks]
+        equal = all(link.map == IDENTITY for link in sinks)
+        if equal and columns == [*range(columns[0], columns[0] + len(columns))]:
+            return instance.writer(names, self._part(columns[0], len(columns)))
+        values, signals = (c_double * len(sinks))(), self._signals
+        write, rows = instance.writer(names, values), [(link.map, column) for link, column in zip(sinks, columns)]
 
         def move() -> None:
-            signals[first:last] = read()
+            values[:] = [affine.of(signals[column]) for affine, column in rows]
+            write()
 
         return move
 
-    def _write(self, write: Callable[[list[float]], None], sinks: Sequence[Link]) -> Callable[[], None]:
-        """Return a function that sets inputs from signals."""
-        signals, columns = self._signals, [self._places[link.source] for link in sinks]
-        if all(link.map == IDENTITY for link in sinks):
-            return lambda: write([signals[column] for column in columns])
-        rows = [(*link.map, column) for link, column in zip(sinks, columns)]
-        return lambda: write([gain * signals[column] + offset for gain, offset, column in rows])
+    def _read_one(self, instance: Instance, node: Node, _node: Node) -> None:
+        self._discrete[node] = instance.value(node.connector)
 
-    def _read_one(self, instance: Instance, name: str, place: int) -> None:
-        self._signals[place] = instance.value(name)
-
-    def _set_one(self, instance: Instance, name: str, place: int) -> None:
-        instance.set({name: self._signals[place]})
+    def _set_one(self, instance: Instance, node: Node, source: Node) -> None:
+        instance.set({node.connector: self._discrete[source]})
 
 
 @contextmanager
