@@ -34,21 +34,29 @@ def pd_fmu(feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: fl
         ("Kd", 9, "parameter", 'Real start="2.0"'),
         ("enabled", 50, "input", 'Boolean start="true"'),
         ("steps", 60, "output", "Integer"),
+        ("on", 51, "output", "Boolean"),
+        ("seen", 61, "input", 'Integer start="0"'),
+        ("text", 70, "input", 'String start=""'),
+        ("mode", 71, "input", 'Enumeration declaredType="Mode" start="1"'),
     ]
-    varies = {"parameter": "fixed", "Boolean": "discrete", "Integer": "discrete"}
+    kinds = ("Boolean", "Integer", "String", "Enumeration")
+    varies = {"parameter": "fixed"} | dict.fromkeys(kinds, "discrete")
     variables = "".join(
         f'<ScalarVariable name="{name}" valueReference="{vr}" causality="{causality}"'
         f' variability="{varies.get(causality, varies.get(kind.split()[0], "continuous"))}"><{kind}/></ScalarVariable>'
         for name, vr, causality, kind in rows
     )
-    outputs = "".join(f'<Unknown index="{i}" {feedthrough.format(f"{i - 6} {i - 4} {i - 2} 11")}/>' for i in (7, 8))
+    outputs = "".join(f'<Unknown index="{i}" {feedthrough.format(f"{i - 6} {i - 4} {i - 2} 11 14")}/>' for i in (7, 8))
     xml = f"""<fmiModelDescription fmiVersion="2.0" modelName="pd" guid="pd">
 <CoSimulation modelIdentifier="pd"/>
 <UnitDefinitions><Unit name="{unit}"><BaseUnit rad="1" factor="{factor!r}"/></Unit>
 <Unit name="rad/s"><BaseUnit rad="1" s="-1"/></Unit>
 <Unit name="N.m"><BaseUnit kg="1" m="2" s="-2"/></Unit></UnitDefinitions>
+<TypeDefinitions><SimpleType name="Mode"><Enumeration><Item name="a" value="1"/></Enumeration></SimpleType>
+</TypeDefinitions>
 <ModelVariables>{variables}</ModelVariables>
-<ModelStructure><Outputs>{outputs}<Unknown index="12" dependencies=""/></Outputs></ModelStructure>
+<ModelStructure><Outputs>{outputs}<Unknown index="12" dependencies=""/><Unknown index="13" dependencies="11"/>
+</Outputs></ModelStructure>
 </fmiModelDescription>"""
     sources = {**standard_headers(), "pd.c": (HERE / "native/pd.c").read_bytes()}
     library = compile_library(sources, "linux64", "pd", units=["pd.c"], flags=["-fvisibility=default"])

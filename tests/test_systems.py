@@ -6,6 +6,7 @@ import json
 import re
 import time
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +160,35 @@ def test_what_is_probably_not_meant_gets_a_line(
     assert [record.getMessage() for record in caplog.records] == [f"'{two}': {line}"]
 
 
+def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """Annotations, geometry, empty units and elements, unknown units, further kinds of connectors, SSP 2.0's number."""
+    note = '<ssd:Annotations><ssc:Annotation type="x"><o:Step xmlns:o="o" size="1"/></ssc:Annotation></ssd:Annotations>'
+    where = '<ssc:Real unit=""/><ssd:ConnectorGeometry x="0" y="0.5"/>'
+    extent = '<ssd:ElementGeometry x1="0" y1="0" x2="1" y2="1"/>'
+    ports = connectors({"q[1]": "input", "tau[1]": "output"}, where)
+    given = binding(values("q_des[1] Real 0.3", "q_des[2] Real 0.2", "Kp Real 0.1 -", "Kd Real 0.01", "more Real 1"))
+    elements = component("plant", connectors({"c": "calculatedParameter"}, "")) + component(
+        "pd", ports + extent + given
+    )
+    turned = "".join(
+        f'<ssd:Connection endElement="pd" endConnector="{g}[{i}]" startElement="plant" startConnector="{g}[{i}]">'
+        '<ssd:ConnectionGeometry pointsX="0 1" pointsY="0 1"/></ssd:Connection>'
+        for g in "qv"
+        for i in (1, 2)
+    )
+    turned += "".join(connection(f"plant.tau_cmd[{i}]", f"pd.tau[{i}]") for i in (1, 2))
+    top = '<ssd:Connection startElement="" startConnector="on" endElement="pd" endConnector="enabled"/>'
+    on = connectors({"on": "input"}, "<ssc:Boolean/>") + binding(values("on Boolean true"))
+    system = f"{on}<ssd:Elements>{elements}</ssd:Elements><ssd:Connections>{turned}{top}</ssd:Connections>{note}"
+    default = f'<ssd:DefaultExperiment stopTime="0.5">{note}</ssd:DefaultExperiment>'
+    expected = by_hand(plant, tmp_path / "plant.fmu")
+    for version in (b"1.0", b"2.0"):
+        text = ssd(system, default).replace(b'version="1.0" name', b'version="%s" name' % version)
+        path = loop(tmp_path / "loop.ssp", plant, pd, text)
+        assert twodof.experiment(path, step=H).steps == N
+        np.testing.assert_array_equal(q_of(path), expected)
+
+
 def nested(plant: bytes, pd: bytes, path: Path, factor: float = 2.0) -> Path:
     """Write a system whose controller is two systems deep, with a gain and an offset before its target."""
     kinds = {"q": "input", "v": "input", "goal": "input deg", "tau": "output"}
@@ -245,6 +275,34 @@ def test_truth_values_are_connected(plant: bytes, pd: bytes, tmp_path: Path) -> 
     np.testing.assert_array_equal(q_of(system, on=False, **settings), free)
 
 
+@pytest.mark.parametrize("on", [True, False])
+def test_discrete_outputs_are_connected(plant: bytes, pd: bytes, tmp_path: Path, on: bool) -> None:
+    """The second controller takes from the first whether it is enabled, and the number of steps, until 20."""
+    twin = component("pd").replace('name="pd"', 'name="twin"')
+    wires = WIRES.replace('"pd"', '"twin"') + connection("pd.on", "twin.enabled") + connection("pd.steps", "twin.seen")
+    elements = BOTH.replace("</ssd:Elements>", f"{twin}</ssd:Elements>")
+    system = loop(tmp_path / "loop.ssp", plant, pd, ssd(f"{elements}<ssd:Connections>{wires}</ssd:Connections>"))
+    samples = count()
+    expected = by_hand(
+        plant, tmp_path / "plant.fmu", lambda q, v: law(q, v) if next(samples) < 20 and on else np.zeros(2)
+    )
+    settings = dict(twin__Kp=0.1, twin__Kd=0.01, twin__q_des=TARGET, pd__enabled=on)
+    np.testing.assert_array_equal(q_of(system, **settings), expected)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_output_may_go_to_several_inputs_and_to_a_part_of_an_array(pd: bytes, tmp_path: Path, fmi: int) -> None:
+    options = twodof.FmuOptions(native=True, fmi=fmi, control="effort")
+    plant = twodof.build_fmu(tmp_path / "plant.fmu", options).read_bytes()
+    wires = WIRES.replace(connection("plant.q[2]", "pd.q[2]"), connection("plant.q[1]", "pd.q[2]"))
+    wires = wires.replace(connection("pd.tau[1]", "plant.tau_cmd[1]"), "")
+    system = loop(tmp_path / "loop.ssp", plant, pd, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
+    expected = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: np.array([0.02, law(q[[0, 0]], v)[1]]))
+    settings = {**GAINS, "pd.q_des": TARGET, "plant.tau_cmd[1]": 0.02}
+    run = twodof.samples(system, step=H, stop_time=N * H, settings=settings)
+    np.testing.assert_array_equal([sample.q for sample in run], expected)
+
+
 def test_an_input_that_changes_acts_from_that_instant(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     targets = [TARGET if k < 20 else -TARGET for k in range(N + 1)]
     system = loop(tmp_path / "loop.ssp", plant, pd)
@@ -323,6 +381,13 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     yield "no element", ssd(more.format(connection("dp.tau[1]", "plant.tau_ext[1]"))), {}, "names 'dp'"
     yield "outputs", ssd(more.format(connection("pd.tau[1]", "plant.q[1]"))), {}, "not from an output to an input"
     yield "types", ssd(more.format(connection("pd.steps", "plant.tau_ext[1]"))), {}, "of type Integer and Real"
+    for kind, name in (("String", "text"), ("Enumeration", "mode")):
+        own = connectors({"word": "input"}, "")
+        parts = ssd(own + more.format(connection("word", f"pd.{name}")))
+        yield kind, parts, {}, f"'word' and 'pd.{name}' are of type {kind}: not supported"
+    me = wired.replace("source=", 'implementation="ModelExchange" source=', 1)
+    yield "Model Exchange", ssd(me), {}, "component 'plant' is a Model Exchange FMU"
+    yield "version", ssd(wired).replace(b'version="1.0" name', b'version="3.0" name'), {}, "The value '3.0' is not"
     own = '<ssc:MapEntry source="true" target="false"/>'.join(
         ("<ssc:BooleanMappingTransformation>", "</ssc:BooleanMappingTransformation>")
     )

@@ -1,13 +1,14 @@
-/* A co-simulation FMU of FMI 2.0: tau = Kp (q_des - q) - Kd v of N joints, and a count of its steps. */
+/* A co-simulation FMU of FMI 2.0: tau = Kp (q_des - q) - Kd v of N joints, or 0 if it is not enabled or has seen MOST
+   steps; and a count of its steps. */
 #include <stdlib.h>
 
 #include "fmi2FunctionTypes.h"
 
-enum { N = 2, Q = 0, V = N, Q_DES = 2 * N, TAU = 3 * N, KP = 4 * N, KD, ENABLED = 50, STEPS = 60 };
+enum { N = 2, Q = 0, V = N, Q_DES = 2 * N, TAU = 3 * N, KP = 4 * N, KD, MOST = 20 };
 
 typedef struct {
     double value[KD + 1];
-    int enabled, steps;
+    int enabled, steps, seen;
 } Controller;
 
 const char *fmi2GetVersion(void) { return "2.0"; }
@@ -47,7 +48,7 @@ fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference vr[], s
 {
     Controller *c = component;
     for (int i = 0; i < N; i++)
-        c->value[TAU + i] = c->enabled ? c->value[KP] * (c->value[Q_DES + i] - c->value[Q + i])
+        c->value[TAU + i] = c->enabled && c->seen < MOST ? c->value[KP] * (c->value[Q_DES + i] - c->value[Q + i])
                                              - c->value[KD] * c->value[V + i] : 0.0;
     for (size_t i = 0; i < n; i++)
         value[i] = c->value[vr[i]];
@@ -62,6 +63,22 @@ fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t
     return fmi2OK;
 }
 
+fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Boolean value[])
+{
+    (void)vr;
+    for (size_t i = 0; i < n; i++)
+        value[i] = ((Controller *)c)->enabled;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer value[])
+{
+    (void)vr;
+    if (n > 0)
+        ((Controller *)c)->seen = value[0];
+    return fmi2OK;
+}
+
 fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Integer value[])
 {
     (void)vr;
@@ -72,7 +89,7 @@ fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t
 
 /* The calls that no importer makes: FMPy only loads a library that has them all. */
 #define NEVER(name) fmi2Status fmi2##name(void) { return fmi2Error; }
-NEVER(SetDebugLogging) NEVER(GetBoolean) NEVER(GetString) NEVER(SetInteger) NEVER(SetString) NEVER(GetFMUstate)
+NEVER(SetDebugLogging) NEVER(GetString) NEVER(SetString) NEVER(GetFMUstate)
 NEVER(SetFMUstate) NEVER(FreeFMUstate) NEVER(SerializedFMUstateSize) NEVER(SerializeFMUstate)
 NEVER(DeSerializeFMUstate) NEVER(GetDirectionalDerivative) NEVER(SetRealInputDerivatives)
 NEVER(GetRealOutputDerivatives) NEVER(CancelStep) NEVER(GetStatus) NEVER(GetRealStatus) NEVER(GetIntegerStatus)

