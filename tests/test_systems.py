@@ -166,7 +166,7 @@ def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp
     where = '<ssc:Real unit=""/><ssd:ConnectorGeometry x="0" y="0.5"/>'
     extent = '<ssd:ElementGeometry x1="0" y1="0" x2="1" y2="1"/>'
     ports = connectors({"q[1]": "input", "tau[1]": "output"}, where)
-    given = binding(values("q_des[1] Real 0.3", "q_des[2] Real 0.2", "Kp Real 0.1 -", "Kd Real 0.01", "more Real 1"))
+    given = binding(values("q_des[1] Real 0.3", "q_des[2] Real 0.2", "Kp Real 0.1 -", "Kd Real 0.01", "more String x"))
     elements = component("plant", connectors({"c": "calculatedParameter"}, "")) + component(
         "pd", ports + extent + given
     )
@@ -383,8 +383,11 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     yield "types", ssd(more.format(connection("pd.steps", "plant.tau_ext[1]"))), {}, "of type Integer and Real"
     for kind, name in (("String", "text"), ("Enumeration", "mode")):
         own = connectors({"word": "input"}, "")
-        parts = ssd(own + more.format(connection("word", f"pd.{name}")))
-        yield kind, parts, {}, f"'word' and 'pd.{name}' are of type {kind}: not supported"
+        system = ssd(own + more.format(connection("word", f"pd.{name}")))
+        yield kind, system, {}, f"'word' and 'pd.{name}' are of type {kind}: not supported"
+    for kind, name, value in (("String", "text", "%fmu%/a.zip"), ("Enumeration", "mode", "a")):
+        parts = wired.replace(component("pd"), component("pd", binding(values(f"{name} {kind} {value}"))))
+        yield f"{kind} value", ssd(parts), {}, f"the value of 'pd.{name}', '{value}', is text or an enumeration"
     me = wired.replace("source=", 'implementation="ModelExchange" source=', 1)
     yield "Model Exchange", ssd(me), {}, "component 'plant' is a Model Exchange FMU"
     yield "version", ssd(wired).replace(b'version="1.0" name', b'version="3.0" name'), {}, "The value '3.0' is not"

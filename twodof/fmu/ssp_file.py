@@ -68,10 +68,13 @@ IDENTITY = Affine()
 
 
 class Parameter(NamedTuple):
-    """A value of a parameter set, whether its unit is converted, and the map that is applied afterwards."""
+    """A value of a parameter set, whether its unit is converted, and the map that is applied afterwards.
+
+    The value is text if its type is String, Enumeration or Binary.
+    """
 
     name: str
-    value: float | bool
+    value: float | bool | str
     unit: Unit
     converts: bool = True
     map: Affine = IDENTITY
@@ -205,10 +208,9 @@ class _File:
         for xml in rows:
             kind = next(child for child in xml if child.tag.startswith(SSV))
             text, unit = kind.get("value", ""), kind.get("unit", "")
-            of_kind = NUMBERS.get(kind.tag.removeprefix(SSV))
-            if of_kind is not None:  # variables here accept no text
-                own = xml.get("name", "")
-                given[prefix + own] = Parameter(prefix + own, of_kind(text.strip()), units.get(unit, Unit(unit)))
+            of_kind, own = NUMBERS.get(kind.tag.removeprefix(SSV)), xml.get("name", "")
+            value = text if of_kind is None else of_kind(text.strip())
+            given[prefix + own] = Parameter(prefix + own, value, units.get(unit, Unit(unit)))
         mapping = binding.find(f"{SSD}ParameterMapping")
         if mapping is None:
             yield from given.values()

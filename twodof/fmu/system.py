@@ -186,6 +186,8 @@ def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
 def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> float | bool:
     """Return the value of a parameter for a variable or connector, in its unit and of its type."""
     value, scalar, total = parameter.value, wiring.scalar(node), parameter.map
+    if isinstance(value, str):
+        raise FmuError(f"'{path}': the value of '{node}', '{value:.80}', is text or an enumeration: not supported")
     if parameter.converts:
         total = total.after(wiring.conversion(parameter.unit, wiring.unit(node), f"'{node}' and its value"))
     kind = "Real" if scalar is None else scalar.type

@@ -105,7 +105,7 @@ class SystemInstance:
         self._each(self._moves)
 
     def _each(self, calls: Sequence[tuple[str, Callable[..., object]]], *arguments: float) -> None:
-        """Call functions in order; an error names the component."""
+        """Run functions in order; an error names the component."""
         name = ""
         try:
             for each in calls:
