@@ -400,6 +400,10 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     yield "up", ssd(wired.replace("resources/pd.fmu", "../pd.fmu")), {}, "is no file in it"
     package = 'type="application/x-ssp-package" source='
     yield "package", ssd(wired.replace("source=", package, 1)), {}, "of type application/x-ssp-package"
+    dotted, inner = (component("pd").replace('name="pd"', f'name="{name}"') for name in ("a.b", "b"))
+    inner = f'<ssd:System name="a"><ssd:Elements>{inner}</ssd:Elements></ssd:System>'
+    elements = BOTH.replace("</ssd:Elements>", f"{dotted}{inner}</ssd:Elements>")
+    yield "names", ssd(elements), {}, "two elements have the name 'a.b'"
     yield "schema", ssd(wired.replace("ssd:Elements", "ssd:Parts")), {}, "is not valid SSP 1.0"
     yield "entities", b"<!DOCTYPE x [<!ENTITY a 'b'>]>" + ssd(wired), {}, "declares entities"
     many = "".join(f'<ssd:Component name="c{i}" source="resources/pd.fmu"/>' for i in range(10_000))

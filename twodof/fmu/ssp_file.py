@@ -127,10 +127,15 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
             assert top is not None  # the schema requires it
             if sum(1 for _ in top.iter(f"{SSD}Component")) > MAX_COMPONENTS:
                 raise FmuError(f"'{path}' has more than {MAX_COMPONENTS} components; OMSimulator takes larger systems")
+            system = file.element(top, "", units)
+            if twice := next((name for name, n in Counter(e.name for e in system.walk()).items() if n > 1), None):
+                raise FmuError(
+                    f"'{path}': two elements have the name '{twice}', with that of their systems; rename one"
+                )
             default = root.find(f"{SSD}DefaultExperiment")
             times = {} if default is None else default.attrib
             experiment = DefaultExperiment(startTime=times.get("startTime"), stopTime=times.get("stopTime"))
-            return root.get("name", ""), file.element(top, "", units), experiment, archive.read(STRUCTURE)
+            return root.get("name", ""), system, experiment, archive.read(STRUCTURE)
     except OSError as error:
         raise FmuError(f"cannot read '{path}': {error.strerror or error}") from error
     except ZIP_ERRORS as error:
@@ -185,8 +190,6 @@ class _File:
         for child in xml.iterfind(f"{SSD}Elements/*"):
             own = f"{name}.{child.get('name')}" if name else child.get("name", "")
             element.children.append(self.element(child, own, units))
-        if len({child.name for child in element.children}) < len(element.children):
-            raise FmuError(f"'{self._path}': system '{name or 'of all'}' has two elements of one name")
         element.connections = [*xml.iterfind(f"{SSD}Connections/{SSD}Connection")]
         return element
 
