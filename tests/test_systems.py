@@ -415,6 +415,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     for kind, text, message in (
         ("<ssc:Real{}/>", "input deg", r"'pd\.q\[1\]' states the unit 'deg', and its FMU another, 'rad'"),
         ("<ssc:Real{}/>", "input turn", r"'pd\.q\[1\]' states the unit 'turn', and its FMU another, 'rad'"),
+        ("<ssc:Real/>", "output", r"'pd\.q\[1\]' states the kind output, and its FMU input"),
         ("<ssc:Integer/>", "input", r"'pd\.q\[1\]' states the type Integer, and its FMU Real"),
     ):
         parts = wired.replace(component("pd"), component("pd", connectors({"q[1]": text}, kind)))

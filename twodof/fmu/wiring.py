@@ -90,11 +90,12 @@ class Wiring:
         return self._units[node.element].get(scalar.unit or "", Unit(scalar.unit or ""))
 
     def _check_connector(self, node: Node, connector: Connector, scalar: Scalar) -> None:
-        """Refuse a connector that contradicts its variable in type or unit: its value has those of the variable."""
+        """Refuse a connector that contradicts its variable in kind, type or unit."""
         stated, own = connector.unit, self._own_unit(node, scalar)
         what = f"'{self._path}': the connector '{node}' states"
-        if connector.type in NUMBERS and scalar.type in NUMBERS and connector.type != scalar.type:
-            raise FmuError(f"{what} the type {connector.type}, and its FMU {scalar.type}; state that of the FMU")
+        for word, says, has in (("type", connector.type, scalar.type), ("kind", connector.kind, scalar.causality)):
+            if {says, has} <= {*NUMBERS, "input", "output"} and says != has:
+                raise FmuError(f"{what} the {word} {says}, and its FMU {has}; state that of the FMU")
         if stated.exponents is None or own.exponents is None:
             return
         alike = stated.exponents == own.exponents and math.isclose(stated.factor, own.factor, rel_tol=ROUNDING)
