@@ -438,6 +438,19 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     ring = ring.replace(connection("plant.q[1]", "pd.q[1]"), connection("a.y", "pd.q[1]"))
     parts = BOTH.replace("</ssd:Elements>", circle + "</ssd:Elements>")
     yield "circle", ssd(f"{parts}<ssd:Connections>{ring}</ssd:Connections>"), {}, "circle of systems"
+    ends = [*range(120)]
+    through = connectors({f"x{k}": "input" for k in ends} | {f"y{k}": "output" for k in ends})
+    within = "".join(connection(f"x{k}", f"y{k}") for k in ends)
+    row = "".join(connection(f"a.y{k}", f"a.x{k + 1}") for k in ends[:-1]) + connection("a.y119", "pd.q_des[1]")
+    snake = f'<ssd:System name="a">{through}<ssd:Connections>{within}</ssd:Connections></ssd:System>'
+    parts = BOTH.replace("</ssd:Elements>", snake + "</ssd:Elements>")
+    yield "long", ssd(f"{parts}<ssd:Connections>{row}</ssd:Connections>"), {}, "or longer than 100"
+    empty = "".join(f'<ssd:System name="s{k}"/>' for k in range(101))
+    yield "systems", ssd(f"<ssd:Elements>{empty}</ssd:Elements>"), {}, "more than 100 components and systems"
+    kilobytes = values(*(f"p{k} Real 1" for k in range(2000)))
+    again = '<ssd:ParameterBinding source="p.ssv"/>' * 100
+    again = f"<ssd:ParameterBindings>{again}</ssd:ParameterBindings>"
+    yield "bound again", ssd(again + BOTH), {"p.ssv": kilobytes.encode()}, "have more than 8388608 bytes"
 
 
 @pytest.mark.parametrize(

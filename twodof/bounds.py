@@ -10,11 +10,11 @@ MAX_UNZIPPED = 2048 * MIB
 MAX_FOLDERS_DEEP = 50  # nested folders
 
 # FMUs
-MAX_DESCRIPTION = 8 * MIB  # some 50,000 variables
+MAX_DESCRIPTION = 8 * MIB  # some 50,000 variables; of a system: structure, parameter sets and mappings together
 MAX_ELEMENTS = 50_000  # elements of all arrays of FMI 3.0, including aliases
 MAX_NAME = 1000  # characters of a variable's name
 MAX_DIMENSIONS = 16  # dimensions of an array of FMI 3.0; a matrix has 2
-MAX_COMPONENTS = 100  # FMUs of a system
+MAX_COMPONENTS = 100  # FMUs and systems in a system, and connections in a row
 MAX_DESCRIPTIONS = 16 * MIB  # descriptions of all FMUs of a system
 MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB

@@ -11,6 +11,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -125,8 +126,9 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
             units = _units(root.find(f"{SSD}Units"))
             top = root.find(f"{SSD}System")
             assert top is not None  # the schema requires it
-            if sum(1 for _ in top.iter(f"{SSD}Component")) > MAX_COMPONENTS:
-                raise FmuError(f"'{path}' has more than {MAX_COMPONENTS} components; OMSimulator takes larger systems")
+            if sum(each.tag in (f"{SSD}Component", f"{SSD}System") for each in top.iterfind(".//*")) > MAX_COMPONENTS:
+                what = f"more than {MAX_COMPONENTS} components and systems"
+                raise FmuError(f"'{path}' has {what}; OMSimulator takes larger systems")
             system = file.element(top, "", units)
             if twice := next((name for name, n in Counter(e.name for e in system.walk()).items() if n > 1), None):
                 raise FmuError(
@@ -146,7 +148,7 @@ class _File:
     """An open SSP file, read by the names in its XML."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
-        self._path, self._archive, self._names = path, archive, {*archive.namelist()}
+        self._path, self._archive, self._names, self._room = path, archive, {*archive.namelist()}, MAX_DESCRIPTION
 
     def xml(self, name: str, kind: str) -> ET.Element:
         """Return the root of an XML member, validated by its schema."""
@@ -159,9 +161,12 @@ class _File:
 
     def _checked(self, content: bytes, name: str, kind: str) -> ET.Element:
         content = content.replace(b'version="2.0"', b'version="1.0"')  # the schema refuses by name what 1.0 lacks
+        self._room -= len(content)
+        if self._room < 0:
+            what = "its structure, parameter sets and mappings, each as often as it is bound"
+            raise FmuError(f"'{self._path}': {what}, have more than {MAX_DESCRIPTION} bytes")
         try:
-            schema = lxml.etree.XMLSchema(file=SCHEMAS / f"SystemStructure{kind}.xsd")
-            lxml.etree.fromstring(content, lxml.etree.XMLParser(schema=schema))
+            lxml.etree.fromstring(content, lxml.etree.XMLParser(schema=_schema(kind)))
             return ET.fromstring(content)
         except (lxml.etree.LxmlError, ET.ParseError) as error:
             raise FmuError(f"'{self._path}': {name} is not valid SSP 1.0: {error!s:.300}") from error
@@ -243,6 +248,11 @@ class _File:
         if xml.get("sourceBase", "SSD") != "SSD":
             raise FmuError(f"'{self._path}': '{name}' has a parameter file inside its FMU: not supported")
         return self.xml(self._member(xml.get("source", ""), name or "the system"), kind)
+
+
+@cache
+def _schema(kind: str) -> lxml.etree.XMLSchema:
+    return lxml.etree.XMLSchema(file=SCHEMAS / f"SystemStructure{kind}.xsd")
 
 
 def _units(xml: ET.Element | None) -> dict[str, Unit]:

@@ -8,6 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
+from ..bounds import MAX_COMPONENTS
 from ..errors import FmuError, choice
 from .description import Fmu, Scalar
 from .ssp_file import EXPONENTS, IDENTITY, Affine, Connector, Element, Unit, transformation
@@ -146,8 +147,9 @@ class Wiring:
             way = [target]
             while way[-1] in self._incoming:
                 source = self._incoming[way[-1]][0]
-                if source in way:
-                    raise FmuError(f"'{self._path}': the connections to '{target}' are a circle of systems")
+                if source in way or len(way) > MAX_COMPONENTS:
+                    what = f"a circle of systems, or longer than {MAX_COMPONENTS}"
+                    raise FmuError(f"'{self._path}': the connections to '{target}' are {what}")
                 way.append(source)
                 if source.element in self._fmus:
                     break
