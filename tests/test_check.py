@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import zipfile
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
+from xml.sax.saxutils import quoteattr
 
 import fmpy
 import pytest
+from fmpy.model_description import ModelDescription, ModelVariable
+from fmpy.validation import _validate_variable_names
 from systems import loop, pd_fmu
 from tools import needs
 
@@ -18,6 +23,7 @@ from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.fmu import checking
 from twodof.fmu.trials import TRIALS
+from twodof.fmu.validation import problems_of_names
 
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="Foreign" guid="1" numberOfEventIndicators="0">
@@ -132,6 +138,13 @@ def test_a_call_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "state" not in texts
 
 
+def test_an_fmu_has_limited_memory_and_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    texts = failed(twodof.check(foreign(Path(), "GREEDY")))
+    assert texts["reset"] == "it ended its process at: reset: Aborted"
+    assert {path.name for path in tmp_path.iterdir()} == {"Foreign.fmu", "Foreign.so"}
+
+
 def test_an_undeclared_dependency_fails(tmp_path: Path) -> None:
     described = DESCRIPTION.replace('<Unknown index="4"/></InitialUnknowns>', '<Unknown index="4" dependencies="2"/>')
     described = described.replace('dependencies="2"/>', 'dependencies="2"/></InitialUnknowns>')
@@ -166,6 +179,32 @@ def test_a_description_with_problems_fails(tmp_path: Path) -> None:
     assert outcomes.pop("description")[0] == "failed"
     assert {*outcomes} == {*TRIALS}
     assert {*outcomes.values()} == {("does not apply", "it was not run, because its description cannot be read")}
+
+
+NAMES = """a _a1 1a a.b a[1] a[1,2].b_2[3] a[] a. der(x) der(x[1]) der(x,2) der(x,) der(a.b[1],3) der(der(x)) 'a-b'
+'a''b' 'it\\'s' '\\n' '' 'ö' ö a-b 'a'.b['1'] x' 'a[1].der(x)'[2] der der( der() der(x).y ٣ a٣ a[٣]""".split()
+
+
+@pytest.mark.parametrize("kind", ["flat", "structured"])
+def test_names_are_those_that_fmpy_allows(kind: str) -> None:
+    """FMPy's parser of names takes a minute for the 20,000 that come after."""
+    variables = "".join(f"<Real name={quoteattr(name)}/>" for name in (*NAMES, "a\tb"))
+    root = ET.fromstring(f'<fmi variableNamingConvention="{kind}"><ModelVariables>{variables}</ModelVariables></fmi>')
+    known = [ModelVariable(name=name, valueReference=0) for name in (*NAMES, "a\tb")]
+    theirs = _validate_variable_names(ModelDescription(modelVariables=known, variableNamingConvention=kind))
+    wrong = [text.partition(" is no legal")[0] for text in problems_of_names(root)]
+    assert wrong == [re.match(r'(?:Variable )?("[^"]*")', text)[1] for text in theirs]
+    many = "".join(f'<Real name="part{k}.q[{k},1]"/>' for k in range(20_000))
+    root = ET.fromstring(f'<fmi variableNamingConvention="{kind}"><ModelVariables>{many}</ModelVariables></fmi>')
+    assert problems_of_names(root) == []
+
+
+def test_a_description_of_many_problems_has_some_in_its_row(tmp_path: Path) -> None:
+    variables = "".join(
+        f'<ScalarVariable name="{k}" valueReference="{100 + k}"><Real unit="u"/></ScalarVariable>' for k in range(500)
+    )
+    described = DESCRIPTION.replace("</ModelVariables>", f"{variables}</ModelVariables>")
+    assert failed(twodof.check(foreign(tmp_path, description=described)))["description"].endswith("; and 480 more")
 
 
 def test_an_fmu_for_another_machine_is_not_run(tmp_path: Path) -> None:

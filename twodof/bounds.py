@@ -20,6 +20,7 @@ MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB
 MAX_SOURCE = 16 * MIB  # a C file
 MAX_CALL_WAIT = 60  # s of wall time, one call of an FMU under check
+MAX_CHECK_MEMORY = 4096 * MIB  # address space of an FMU under check; a Python FMU takes 0.5 GiB, more on many cores
 MAX_REFERENCES = 16 * MIB  # the references in an FMU, each file as often as it is read
 MAX_ROW = 64 * KIB  # a message of the checking process
 MIN_STEP = 1e-6  # s, communication step: a run with a step of 1e-300 s would never end

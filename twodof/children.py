@@ -180,23 +180,21 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
         seconds: processor time since its start.
         folders: the only folders whose files it may read, on kernels with Landlock.
     """
-    limits = {
-        resource.RLIMIT_AS: memory,
-        resource.RLIMIT_CPU: seconds,
-        resource.RLIMIT_CORE: 0,
-        resource.RLIMIT_FSIZE: 0,
-        resource.RLIMIT_NOFILE: DESCRIPTORS,
-    }
-    for kind, most in limits.items():
-        hard = resource.getrlimit(kind)[1]
-        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (most, most))
+    limit(memory, {resource.RLIMIT_CPU: seconds, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_NOFILE: DESCRIPTORS})
     if sys.platform == "linux":
         libc = ctypes.CDLL(None)
         if libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0) == 0:
             _allow_files(libc, folders)
             if platform.machine() == "x86_64":
                 _allow_calls(libc)
+
+
+def limit(memory: int, others: Mapping[int, int] | None = None) -> None:
+    """Limit the address space of this process, bytes, and other resources; it leaves no core dump."""
+    for kind, most in {resource.RLIMIT_AS: memory, resource.RLIMIT_CORE: 0, **(others or {})}.items():
+        hard = resource.getrlimit(kind)[1]
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (most, most))
 
 
 def limit_time(seconds: float) -> None:

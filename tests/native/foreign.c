@@ -1,11 +1,12 @@
 /* An FMI 2.0 FMU of another maker, ẋ = u − x by Euler's method, y = x + 2 u; with one fault where FAULT names one. */
 #include <math.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <unistd.h>
 #include "fmi2Functions.h"
 
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
-       READS_CHANGE, COUNTS };
+       READS_CHANGE, COUNTS, GREEDY };
 typedef struct { double u, x, p; int phase; } M;
 static double shared;
 static int count;
@@ -22,6 +23,7 @@ void fmi2FreeInstance(fmi2Component c) { free(c); }
 fmi2Status fmi2Reset(fmi2Component c) {
     double x = ((M *)c)->x;
     if (FAULT == HANGS) for (;;) sleep(1);
+    if (FAULT == GREEDY && fopen("litter", "w") && !malloc((size_t)5 << 30)) abort();
     start(c);
     if (FAULT == KEEPS) ((M *)c)->x = x;
     return fmi2OK;

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import resource
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
@@ -11,10 +11,11 @@ from pathlib import Path
 from subprocess import DEVNULL
 from typing import NamedTuple
 
-from ..bounds import MAX_CALL_WAIT, MAX_ROW
-from ..children import Child
+from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_ROW
+from ..children import Child, limit
 from ..errors import FmuError, InputError
 from ..export.package import has_member
+from ..files import temporary_folder
 from ..notebook import card
 from .description import Fmu, load_any_fmu, problems_of
 from .importers import require
@@ -25,6 +26,7 @@ from .trial import Trial, UnpassedError
 from .trials import TRIALS, reference_run
 
 REFERENCE, WITH = "reference ", " with "
+MOST_PROBLEMS = 20  # of a description, in its row
 
 
 class Row(NamedTuple):
@@ -106,6 +108,7 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
 def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
     """Yield the rows of an FMU."""
     problems = problems_of(path, inside)
+    problems[MOST_PROBLEMS:] = [f"and {len(problems) - MOST_PROBLEMS} more"] * (len(problems) > MOST_PROBLEMS)
     try:
         known = load_any_fmu(path, inside)
     except FmuError:
@@ -143,7 +146,10 @@ def _tried(fmu: Fmu, names: Sequence[str]) -> Iterator[Row]:
     waiting = [*names]
     while waiting:
         doing = "its start"
-        with Child(_serve, fmu.path, fmu.inside, waiting, output=DEVNULL) as child:
+        with (
+            temporary_folder() as folder,
+            Child(_serve, fmu.path.absolute(), fmu.inside, waiting, folder, output=DEVNULL) as child,
+        ):
             try:
                 while waiting:
                     kind, *words = json.loads(child.receive(MAX_ROW, MAX_CALL_WAIT))
@@ -156,9 +162,10 @@ def _tried(fmu: Fmu, names: Sequence[str]) -> Iterator[Row]:
                 yield Row(waiting.pop(0), "failed", f"it ended its process at: {doing}{limit}: {end}")
 
 
-def _serve(pipe: Connection, path: Path, inside: str, names: Sequence[str]) -> None:
-    """Do the trials in the child; send the name of each call before it, and each result."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+def _serve(pipe: Connection, path: Path, inside: str, names: Sequence[str], folder: Path) -> None:
+    """Do the trials in the child, in a folder; send the name of each call before it, and each result."""
+    limit(MAX_CHECK_MEMORY)
+    os.chdir(folder)
 
     def send(*words: str) -> None:
         pipe.send_bytes(json.dumps(words).encode()[:MAX_ROW])

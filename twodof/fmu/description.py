@@ -25,7 +25,7 @@ from ..files import read_member, shown
 from ..notebook import card, picture
 from ..plant.urdf import RobotError, read_urdf
 from .archives import checksums, open_archive, read_archive
-from .validation import NUMBERS, read_description
+from .validation import NUMBERS, problems_of_names, read_description
 
 
 @dataclass(frozen=True)
@@ -222,13 +222,16 @@ def problems_of(path: Path, inside: str = "") -> list[str]:
         FmuError: there is no description to read.
     """
     xml, _ = read_archive(path, inside)
+    found: list[str] = []
     try:
-        read_description(ET.fromstring(xml), xml, validate_variable_names=True, validate_model_structure=True)
+        root = ET.fromstring(xml)
+        found += problems_of_names(root)
+        read_description(root, xml, validate_model_structure=True)
     except ValidationError as error:
-        return [" ".join(problem.split()) for problem in error.problems]
+        found += [" ".join(problem.split()) for problem in error.problems]
     except Exception as error:  # FMPy raises bare exceptions of several libraries
-        return [f"{error!s:.300}"]
-    return []
+        found.append(f"{error!s:.300}")
+    return found
 
 
 def logged(fmu: Fmu) -> Fmu:

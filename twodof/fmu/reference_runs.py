@@ -104,7 +104,7 @@ def references_of(fmu: Fmu) -> list[Reference]:
     """Return an FMU's experiments with results, by its manifest of FMI-LS-REF; none without a manifest.
 
     Raises:
-        FmuError: a file is damaged or missing, or has another format.
+        FmuError: a file is damaged or missing, or has another format; or two experiments have one name.
     """
     if MANIFEST not in fmu.members:
         return []
@@ -114,9 +114,12 @@ def references_of(fmu: Fmu) -> list[Reference]:
             related = files.xml(posixpath.basename(MANIFEST)).iter("Related")
             sources = [r.get("source", "") for r in related if r.get("role", "").startswith("experiment")]
             found = [files.reference(e) for source in sources for e in files.xml(source).iter("Experiment")]
-        except (KeyError, ValueError, ET.ParseError) as error:
+        except (KeyError, ValueError, csv.Error, ET.ParseError) as error:
             raise FmuError(f"the references in '{fmu.path}' cannot be read: {error}") from error
-    return [reference for reference in found if reference is not None]
+    kept = [reference for reference in found if reference is not None]
+    if len({reference.name for reference in kept}) < len(kept):
+        raise FmuError(f"the references in '{fmu.path}' cannot be told apart: two experiments have one name")
+    return kept
 
 
 class _Files:
