@@ -254,6 +254,14 @@ def test_a_bag_that_is_given_twice_is_refused(bag):
         twodof.fit(ARM, bag, FREE, gravity=(0.0, float("nan"), 0.0))
 
 
+def test_masses_near_zero_are_refused_in_a_line(bag, tmp_path):
+    """SciPy meets an infinity in the prior of such masses."""
+    light = tmp_path / "light.urdf"
+    light.write_text(re.sub(r'mass value="[^"]*"', 'mass value="1e-300"', ARM.read_text("utf-8")), "utf-8")
+    with pytest.raises(InputError, match=re.escape("light.urdf: masses, efforts or speeds are too large or too small")):
+        twodof.fit(light, bag, "*")
+
+
 def test_efforts_that_jump_between_samples_are_named(tmp_path):
     """The target of a continuous controller jumps twice a second; the bag has 100 samples a second."""
     fmu = twodof.build_fmu(tmp_path / "Arm.fmu", twodof.FmuOptions(native=True, settings={"armature": [0.004, 0.004]}))

@@ -82,7 +82,10 @@ def fit(
         raise InputError("`free` names no parameter")
     fitted, held = stretches(recordings, robot)
     _check_units(parameters, fitted)
-    found = estimate(parameters, fitted)
+    try:
+        found = estimate(parameters, fitted)
+    except ValueError as error:  # SciPy and NumPy meet an overflow
+        raise InputError(f"{path.name}: masses, efforts or speeds are too large or too small: {error}") from error
     result = _result(path, text, read, parameters, found, held, jumps(recordings, robot))
     if output is not None:
         result.save(output)
