@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
+from ..version import install
 from .completion import links
 from .options import (
     CommandLineError,
@@ -16,14 +18,14 @@ from .options import (
     not_empty,
     parse_locks,
 )
-from .printing import busy, print_json, print_next, print_table, quote, say
+from .printing import plain, print_json, print_next, print_table, quote, say
 
 
 def add(fit: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     fit.description = (
-        "Fit masses, friction and other parameters of a URDF to bags with positions and efforts. Writes robot.urdf"
-        " and fit.json into a folder. The last fifth of each bag is held out."
+        "Fit masses, friction and other parameters of a URDF to bags with positions and efforts. Writes robot.urdf,"
+        " fit.json and fit.html, a page with its curves, into a folder. The last fifth of each bag is held out."
     )
     option = fit.add_argument
     option("robot", type=Path, metavar="URDF", help="URDF or xacro file with the initial values")
@@ -54,16 +56,18 @@ def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     if not options.free:
         raise CommandLineError("name the free parameters with --free, for example --free 'friction[*]' --free payload")
-    output = Path(options.output or "fitted")
-    with busy(f"fitting {options.robot.name}", silent=True):
-        from ..identification.fitting import fit
+    from ..identification.fitting import fit
+    from ..simulation.progress import counting
 
+    output = Path(options.output or "fitted")
+    with counting(f"fitting {plain(options.robot.name)}", "step", shown=sys.stderr.isatty()) as progress:
         result = fit(
             options.robot,
             options.bags,
             options.free,
             output=output,
             lock=parse_locks(options.locks),
+            progress=progress,
             **given_options(options, "frame", "gravity"),
         )
     if options.json:
@@ -79,5 +83,7 @@ def call(options: argparse.Namespace) -> int:
     )
     same = "".join(f" --lock {quote(lock)}" for lock in options.locks or ())
     same += f" --frame {quote(options.frame)}" if options.frame else ""
+    page = output / "fit.html"
+    say(f"page: {page}" if page.exists() else f"no page: {install('view')}")
     print_next(f"twodof build {quote(output / 'robot.urdf')}{same}{settings}")
     return 0

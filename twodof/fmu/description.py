@@ -23,7 +23,6 @@ from ..export.icon import side_view
 from ..export.start_values import groups_of, vector
 from ..files import read_member, shown
 from ..notebook import card, picture
-from ..plant.urdf import RobotError, read_urdf
 from .archives import checksums, open_archive, read_archive
 from .validation import NUMBERS, problems_of_names, read_description
 
@@ -158,16 +157,12 @@ class Fmu:
 
 def _pose(fmu: Fmu) -> str:
     """Return a picture of the robot at its start, seen along the axis of its smallest extent; "" without a URDF."""
-    from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
+    from ..geometry.kinematics import chains_at  # SciPy takes half a second to import
 
-    try:
-        urdf = read_urdf(fmu.urdf or "")
-    except RobotError:
+    q = [float(fmu.start_values.get(name, 0.0)) for name in fmu.vector("q_start")]
+    if not (chains := chains_at(fmu.urdf or "", fmu.joints[: len(q)], q)):
         return ""
-    q = [[float(fmu.start_values.get(name, 0.0)) for name in fmu.vector("q_start")]]
-    kinematics, parents = Kinematics(urdf, fmu.joints[: len(q[0])]), {joint.parent for joint in urdf.joints.values()}
-    chains = [urdf.chain(link) for link in urdf.links if link not in parents]
-    lines, axes = side_view([[at.translation[0] for at in kinematics.along(chain, q)] for chain in chains])
+    lines, axes = side_view(chains)
     return picture((line.T for line in lines), *(f"{axis} in m" for axis in axes), equal=True)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..plant.urdf import Joint, Urdf
+from ..plant.urdf import Joint, RobotError, Urdf, read_urdf
 
 Array = NDArray[np.float64]
 BLOCK = 10_000  # samples whose arrays fit into the cache
@@ -156,3 +156,14 @@ class Kinematics:
                     jacobian[:, :3, column] += np.cross(axis, arm)
                     jacobian[:, 3:, column] += axis
         return jacobian
+
+
+def chains_at(text: str, joints: Sequence[str], q: Sequence[float]) -> list[list[Array]]:
+    """Return the points, m, of each chain of a URDF's links at positions q, rad or m; none if it is no URDF."""
+    try:
+        urdf = read_urdf(text)
+    except RobotError:
+        return []
+    kinematics, parents = Kinematics(urdf, joints), {joint.parent for joint in urdf.joints.values()}
+    chains = [urdf.chain(link) for link in urdf.links if link not in parents]
+    return [[at.translation[0] for at in kinematics.along(chain, [q])] for chain in chains]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,8 +82,10 @@ class Estimate(NamedTuple):
     converged: bool
 
 
-def estimate(parameters: Parameters, stretches: Sequence[Stretch]) -> Estimate:
-    """Return the most likely coordinates of the free parameters."""
+def estimate(
+    parameters: Parameters, stretches: Sequence[Stretch], finished: Callable[[], None] = lambda: None
+) -> Estimate:
+    """Return the most likely coordinates of the free parameters; ``finished`` is called after each of the PASSES."""
     x, low, scales = parameters.coordinates(_typical(stretches))
     scales, low = np.append(scales, DELAY_SCALE), np.append(low, -np.inf)
     start = np.append(x, 0.0)
@@ -101,6 +103,7 @@ def estimate(parameters: Parameters, stretches: Sequence[Stretch]) -> Estimate:
         z, evaluations = solved.x, evaluations + solved.nfev
         dynamics = parameters.dynamics(parameters.values(z[:-1]))
         sd = [_deviations(each, residual(each, dynamics, float(z[-1]))) for each in rows]
+        finished()
     converged = bool(solved.status > 0 and abs(z[-1] - rows[0].about[1]) <= LARGEST_SHIFT)
     return _result(parameters, rows, sd, z, scales, evaluations, converged)
 

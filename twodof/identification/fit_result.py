@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -13,12 +14,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, PlotError
 from ..files import refusing, temporary_folder
 from ..notebook import card
 from ..version import __version__
+from .curves import Curve, Table
 from .estimate import Misfit
 from .prediction import WINDOW
+
+MOST_NAMES = 6
+"""Largest number of parameters that the page names in its verdict."""
 
 
 class FittedParameter(NamedTuple):
@@ -49,6 +54,7 @@ class Fit:
 
     Attributes:
         urdf: name of the URDF's file.
+        bags: paths of the bags.
         fitted_urdf: text of the URDF with fitted numbers.
         joints: names of the robot's n joints.
         units: "rad" or "m" of each joint.
@@ -63,9 +69,11 @@ class Fit:
         covariance: covariance of the parameters, in their order.
         converged: False if the solution still moved when its steps ended.
         jumps: time of the largest jump, s, by joints whose effort jumps between samples.
+        curves: efforts and positions as measured, and as the model gives them.
     """
 
     urdf: str
+    bags: tuple[str, ...]
     fitted_urdf: bytes
     joints: tuple[str, ...]
     units: tuple[str, ...]
@@ -80,6 +88,7 @@ class Fit:
     covariance: NDArray[np.float64]
     converged: bool
     jumps: Mapping[str, float]
+    curves: tuple[Curve, ...]
 
     @property
     def explains(self) -> bool:
@@ -97,8 +106,28 @@ class Fit:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings and results, one line each."""
+        """Verdict, warnings and results, one line each."""
+        lines = [*self._warnings]
+        if self.unseen:
+            lines.append(f"the data do not determine: {'; '.join(self.unseen)}")
+        for joint, unit, before, after in zip(self.joints, self.units, self.deviation_before, self.deviation):
+            lines.append(
+                f"held out: in windows of {WINDOW:g} s the simulated position of joint '{joint}' differs by"
+                f" {after:.3g} {unit} (rms), before the fit by {before:.3g} {unit}"
+            )
+        return lines
+
+    @property
+    def _warnings(self) -> list[str]:
         lines = []
+        if bad := [misfit for misfit in self.misfits if misfit.bad]:
+            worst = max(bad, key=lambda misfit: misfit.part)
+            lines.append(
+                f"the model does not explain these data, least at joint '{self.joints[worst.joint]}': slow residuals"
+                f" of {worst.rms:.3g} {self._effort_unit(worst.joint)}, {100 * worst.part:.2g} % of its effort, have"
+                f" {worst.ratio:.3g} times the variance of fast ones; free more parameters, or look for what the URDF"
+                " does not have"
+            )
         if not self.converged:
             lines.append("the fit has not converged: free fewer parameters, or record more motion")
         for joint, t in self.jumps.items():
@@ -106,28 +135,18 @@ class Fit:
                 f"the effort of joint '{joint}' jumps between samples, most at {t:.4g} s: its course there is"
                 " unknown, and the intervals are too narrow; record at a higher rate, or a smoother motion"
             )
+        if not lines:
+            lines.append("the model explains these data: its residuals are noise")
         groups = {parameter.name.partition(":")[0] for parameter in self.parameters}
         if "gain" in groups and "mass" not in groups:
             lines.append("gains are right only if the URDF's masses are: free 'mass:*' too, or weigh the robot")
-        if self.unseen:
-            lines.append(f"the data do not determine: {'; '.join(self.unseen)}")
-        if bad := [misfit for misfit in self.misfits if misfit.bad]:
-            worst = max(bad, key=lambda misfit: misfit.part)
-            unit = "N·m" if self.units[worst.joint] == "rad" else "N"
-            lines.append(
-                f"the model does not explain these data, least at joint '{self.joints[worst.joint]}': slow residuals"
-                f" of {worst.rms:.3g} {unit}, {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the"
-                " variance of fast ones; free more parameters, or look for what the URDF does not have"
-            )
         if abs(self.delay[0]) > 5.0 * self.delay[1]:
             side = "after" if self.delay[0] > 0.0 else "before"
             lines.append(f"efforts act {1e3 * abs(self.delay[0]):.3g} ms {side} their stamps")
-        for joint, unit, before, after in zip(self.joints, self.units, self.deviation_before, self.deviation):
-            lines.append(
-                f"held out: in windows of {WINDOW:g} s the simulated position of joint '{joint}' differs by"
-                f" {after:.3g} {unit} (rms), before the fit by {before:.3g} {unit}"
-            )
         return lines
+
+    def _effort_unit(self, joint: int) -> str:
+        return "N·m" if self.units[joint] == "rad" else "N"
 
     def __str__(self) -> str:
         widths = [max(map(len, column)) for column in zip(*self.rows)]
@@ -147,6 +166,7 @@ class Fit:
         return {
             "kind": "fit",
             "urdf": self.urdf,
+            "bags": self.bags,
             "version": __version__,
             "parameters": [p._asdict() for p in self.parameters],
             "unseen": self.unseen,
@@ -164,20 +184,73 @@ class Fit:
             "remarks": self.remarks,
         }
 
+    def page(self) -> bytes:
+        """Return a self-contained HTML page: verdict, tables, and curves as measured and as modelled.
+
+        Raises:
+            PlotError: the extra 'view' is missing.
+        """
+        from .fit_page import fit_page  # matplotlib takes a third of a second to import
+
+        head, *rows = self.rows
+        seen, other = ([row for row, p in zip(rows, self.parameters) if p.known is known] for known in (True, False))
+        lines = self._warnings
+        tables: dict[str, Table] = {f"{len(seen)} of {len(rows)} parameters are determined": [head, *seen]}
+        if other:
+            names = ", ".join(name for name, *_ in other) if len(other) <= MOST_NAMES else f"{len(other)} parameters"
+            lines.append(f"the data do not determine {names}")
+            tables["Not determined: these parameters stay near the URDF's"] = [row[:3] for row in (head, *other)]
+        if self.unseen:
+            tables["Only together: what the data do not determine"] = [("combination",), *zip(self.unseen)]
+        if self.deviation:
+            worst = max(
+                range(len(self.joints)), key=lambda i: (not math.isfinite(self.deviation[i]), self.deviation[i])
+            )
+            _, _, _, after, before = self._joint_rows[1 + worst]
+            lines.append(
+                f"held out: simulated positions are off by at most {after} (rms, '{self.joints[worst]}'),"
+                f" before the fit {before}"
+            )
+        tables["Joints: residuals, and simulated positions (rms)"] = self._joint_rows
+        settings = [f"{name} = {', '.join(map(repr, values))}" for name, values in self.settings.items()]
+        facts = {"bags": "\n".join(self.bags), "settings of a build": "\n".join(settings or ["none"])}
+        facts["made by"] = f"twodof {__version__}"
+        return fit_page(f"Fit of {self.urdf}", lines, tables, facts, dict(zip(self.joints, self.units)), self.curves)
+
+    @property
+    def _joint_rows(self) -> list[tuple[str, ...]]:
+        rows = [
+            ("joint", "noise of the effort", "slow residuals", *["off, held out", "before"][: 2 * len(self.deviation)])
+        ]
+        for i, (joint, unit) in enumerate(zip(self.joints, self.units)):
+            part = f"{100 * self.misfits[i].part:.2g} % of the effort" + ", not noise" * self.misfits[i].bad
+            off = [each[i] for each in (self.deviation, self.deviation_before) if each]
+            held = [f"{rms:.3g} {unit}" if math.isfinite(rms) else "∞: the simulation fails" for rms in off]
+            rows.append((joint, f"{self.noise[i]:.3g} {self._effort_unit(i)}", part, *held))
+        return rows
+
     def save(self, folder: str | Path) -> Path:
-        """Write robot.urdf and fit.json into a new folder, completely or not at all; return its path.
+        """Write robot.urdf, fit.json and fit.html into a new folder, completely or not at all; return its path.
+
+        Without the extra 'view' there is no fit.html.
 
         Raises:
             InputError: the folder exists or cannot be written.
         """
         path = check_folder(folder)
+        contents = {
+            "robot.urdf": self.fitted_urdf,
+            "fit.json": f"{json.dumps(self.facts, indent=2, allow_nan=False)}\n".encode(),
+        }
+        with suppress(PlotError):
+            contents["fit.html"] = self.page()
         with refusing(InputError, f"write '{path}'"):
             path.parent.mkdir(parents=True, exist_ok=True)
             with temporary_folder(path.parent) as draft:
                 inside = draft / "fitted"
                 inside.mkdir()
-                (inside / "robot.urdf").write_bytes(self.fitted_urdf)
-                (inside / "fit.json").write_text(json.dumps(self.facts, indent=2, allow_nan=False) + "\n", "utf-8")
+                for name, content in contents.items():
+                    (inside / name).write_bytes(content)
                 inside.rename(path)
         return path
 

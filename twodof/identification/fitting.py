@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations, count
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,14 @@ from ..bag.reader import read_bag
 from ..bag.recording import Recording
 from ..errors import InputError
 from ..export.urdf_source import end_effector, last_links, lock_joints, read_text
+from ..files import shown
 from ..plant.robot import load_robot
 from ..plant.urdf import RobotError, Urdf, read_urdf
-from .estimate import Estimate, estimate
+from .curves import Comparison, compare
+from .estimate import PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
 from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
-from .prediction import deviation, predict
 from .regression import regressors
 from .stretches import Array, Stretch, jumps, stretches
 
@@ -38,6 +39,7 @@ def fit(
     frame: str | None = None,
     lock: Mapping[str, float] | None = None,
     gravity: Sequence[float] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Fit:
     """Fit parameters of a robot to bags of its motion, with positions and efforts of its joints.
 
@@ -49,10 +51,11 @@ def fit(
         free: names or shell patterns of the free parameters: ``friction[1]``, ``damping[1]``, ``armature[1]``,
             ``offset:JOINT``, ``gain:JOINT``, ``mass:LINK``, ``com:LINK``, ``inertia:LINK``, ``payload``,
             ``payload_com``, ``gravity``.
-        output: new folder for robot.urdf and fit.json; None: nothing is written.
+        output: new folder for robot.urdf, fit.json and fit.html; None: nothing is written.
         frame: link of the payload; None: "EndEffector", or the only last link.
         lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
         gravity: m/s² in the root frame; None: that of the bag's run, else (0, 0, −9.81).
+        progress: called with the numbers of finished and of all steps.
 
     Raises:
         InputError: a bag does not fit the robot, is too short, or has values that are not finite; or a pattern
@@ -82,11 +85,20 @@ def fit(
         raise InputError("`free` names no parameter")
     fitted, held = stretches(recordings, robot)
     _check_units(parameters, fitted)
+    steps = count()
+
+    def finished() -> None:
+        if progress:
+            progress(next(steps), PASSES + 2 * len(held))
+
+    finished()
     try:
-        found = estimate(parameters, fitted)
+        found = estimate(parameters, fitted, finished)
     except ValueError as error:  # SciPy and NumPy meet an overflow
         raise InputError(f"{path.name}: masses, efforts or speeds are too large or too small: {error}") from error
-    result = _result(path, text, read, parameters, found, held, jumps(recordings, robot))
+    models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
+    compared = compare(robot, models, fitted, held, finished)
+    result = _result(path, text, read, parameters, found, compared, recordings)
     if output is not None:
         result.save(output)
     return result
@@ -138,16 +150,13 @@ def _result(
     urdf: Urdf,
     parameters: Parameters,
     found: Estimate,
-    held: Sequence[Stretch],
-    jumps: Mapping[str, float],
+    compared: Comparison,
+    recordings: Sequence[Recording],
 ) -> Fit:
     robot = parameters.robot
-    before, after = parameters.dynamics(parameters.given), parameters.dynamics(found.values)
-    predictions = [predict(robot, after, found.delay[0], stretch) for stretch in held]
-    first = [predict(robot, before, 0.0, stretch) for stretch in held]
-    rms = [deviation(held, each).tolist() if held else [] for each in (first, predictions)]
     return Fit(
         urdf=path.name,
+        bags=tuple(shown(recording.path) for recording in recordings),
         fitted_urdf=fitted_urdf(text, urdf, parameters, found.values),
         joints=robot.joints,
         units=tuple("m" if prismatic else "rad" for prismatic in robot.prismatic),
@@ -156,12 +165,13 @@ def _result(
         misfits=found.misfits,
         noise=tuple(found.noise.tolist()),
         delay=found.delay,
-        deviation_before=tuple(rms[0]),
-        deviation=tuple(rms[1]),
-        settings=_settings(parameters, after, found),
+        deviation_before=compared.deviations[0],
+        deviation=compared.deviations[1],
+        settings=_settings(parameters, parameters.dynamics(found.values), found),
         covariance=found.covariance,
         converged=found.converged,
-        jumps=jumps,
+        jumps=jumps(recordings, robot),
+        curves=compared.curves,
     )
 
 

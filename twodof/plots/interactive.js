@@ -8,7 +8,7 @@ import { plotlyContent } from "../../fmu_src/page/unpack.js";
 /** @typedef {{data: {meta: [number | null, string, string]}[], layout: object}} Chart */
 
 const ROUNDING = 1e-12; // smaller values are shown as 0
-const UNITS_OF = { q: "position", v: "velocity", tau: "effort", error: "distance" };
+const UNITS_OF = { q: "position", v: "velocity", tau: "effort", residual: "residual", error: "distance" };
 
 /** @param {Row} row @param {() => void} changed @returns {HTMLTableRowElement} a box, a look, a name */
 function legendRow(row, changed) {

@@ -7,7 +7,7 @@ library, compressed; ``interactive.js`` unpacks and links them.
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -164,7 +164,7 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, object]]:
 
 
 def over_time(tracks: Sequence[Track]) -> Chart:
-    """Return a figure with a row for each quantity, on one time axis."""
+    """Return a figure of tracks with a row for each quantity."""
     own = _line_styles(tracks)
     rows: dict[str, list[Panel]] = {}
     for panel in sorted(panels_of(tracks, own), key=lambda panel: [*KINDS].index(panel.kind)):
@@ -172,10 +172,15 @@ def over_time(tracks: Sequence[Track]) -> Chart:
         if panel.kind == "error" and panel.note:
             heading += f": {panel.note}"
         rows.setdefault(heading, []).append(panel)
+    return stacked(rows, duration(tracks))
+
+
+def stacked(rows: Mapping[str, Sequence[Panel]], seconds: float) -> Chart:
+    """Return a figure with a row for each heading, on one time axis; panels of a row share its axes."""
     height = len(rows) * (ROW + GAP) - GAP
     time = {
         **AXIS,
-        "range": [0.0, duration(tracks)],
+        "range": [0.0, seconds],
         "title": {"text": "time in s"},
         "anchor": f"y{len(rows)}",
         "showspikes": True,
