@@ -1,11 +1,11 @@
-"""Make docs/view.png, live.png, panda.png, page.png and panda.webp, pictures of the pages.
+"""Make docs/view.png, live.png, panda.png, page.png, fit.png and panda.webp, pictures of the pages.
 
     python docs/make_screenshots.py
 
 The first is the replay of a real run of the default arm, whose target changes; the second a live arm, whose target
 has just been dragged; the third the Panda on its way to a pose, and the fourth in a page of its own. The last one
-moves: the Panda in its page follows three targets. Needs chromium and the packages 'websockets', 'playwright' and
-'example-robot-data'.
+moves: the Panda in its page follows three targets. The page of a fit has a recording by MuJoCo. Needs chromium and
+the packages 'mujoco', 'websockets', 'playwright' and 'example-robot-data'.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import browser  # noqa: E402
+from motions import bag_of, noisy  # noqa: E402
 from native_models import robots_folder  # noqa: E402
 from PIL import Image  # noqa: E402
 from playwright.sync_api import Browser, Page  # noqa: E402
+from test_fit import ARM, FREE, GRAVITY, JOINTS, arm_motion  # noqa: E402
 
 import twodof  # noqa: E402
 
@@ -46,6 +48,7 @@ def main() -> None:
         live(chromium, folder, fmu)
         panda(chromium, folder)
         page(chromium, folder)
+        fit(chromium, folder)
         moving(chromium, folder)
 
 
@@ -95,6 +98,20 @@ def page(chromium: Browser, folder: Path) -> None:
             " arm.set('quat_des', [1, 0, 0.3, 0.2]); arm.step(40); }"
         )
         shoot(shown, "page.png")
+
+
+def fit(chromium: Browser, folder: Path) -> None:
+    """Make the picture of the page of a fit to a recording by MuJoCo."""
+    bag = bag_of(folder / "monday", JOINTS, *noisy(arm_motion()))
+    result = twodof.fit(ARM, bag, (*FREE, "payload_com"), gravity=GRAVITY, output=folder / "fitted")
+    assert result.explains
+    shown = chromium.new_page(viewport=SIZE)
+    shown.goto((folder / "fitted" / "fit.html").as_uri())
+    shown.wait_for_selector("#plots[data-ready]")
+    shown.locator("table.runs").evaluate("table => table.remove()")  # it has the path of the bag
+    picture = Image.open(io.BytesIO(shown.screenshot(full_page=True)))
+    picture.quantize(64).save(ROOT / "docs" / "fit.png", optimize=True)
+    shown.close()
 
 
 def view(chromium: Browser, folder: Path) -> None:
