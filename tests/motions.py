@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from bags import joint_message, write_third_party
 
+import twodof
+
 Array = np.ndarray
 
 
@@ -85,3 +87,12 @@ def bag_of(path: Path, joints: Sequence[str], q: Array, effort: Array | None, st
     efforts = np.empty((len(q), 0)) if effort is None else effort
     rows = zip(stamps.tolist(), q, efforts)
     return write_third_party(path, [("/joint_states", t, joint_message(t, joints, a, (), b)) for t, a, b in rows])
+
+
+def assert_true(result: twodof.Fit, truth: dict[str, float]) -> None:
+    """Each parameter is within three standard deviations, and within 3 % where these say so."""
+    assert truth.keys() == {p.name for p in result.parameters}
+    for p in result.parameters:
+        assert p.known and abs(p.after - truth[p.name]) <= 3.0 * p.deviation, (p, truth[p.name])
+        if 3.0 * p.deviation <= 0.03 * abs(truth[p.name]):
+            assert abs(p.after / truth[p.name] - 1.0) <= 0.03, (p, truth[p.name])

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from motions import bag_of, move, mujoco_model, noisy
-from native_models import robots_folder
+from motions import assert_true, bag_of, move, mujoco_model, noisy
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
-from twodof.plant.robot import load_robot
 
 ARM = Path(__file__).parents[1] / "urdf" / "2dof.urdf"
 GRAVITY = (0.0, -9.81, 0.0)
@@ -49,15 +45,6 @@ def bag(motion: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     other = np.zeros((len(q), 1))
     columns = [np.hstack([each[:, ::-1], other]) for each in (q, effort)]
     return bag_of(tmp_path_factory.mktemp("fit") / "bag", [*JOINTS[::-1], "gripper"], *columns)
-
-
-def assert_true(result: twodof.Fit, truth: dict[str, float]) -> None:
-    """Each parameter is within three standard deviations, and within 3 % where these say so."""
-    assert truth.keys() == {p.name for p in result.parameters}
-    for p in result.parameters:
-        assert p.known and abs(p.after - truth[p.name]) <= 3.0 * p.deviation, (p, truth[p.name])
-        if 3.0 * p.deviation <= 0.03 * abs(truth[p.name]):
-            assert abs(p.after / truth[p.name] - 1.0) <= 0.03, (p, truth[p.name])
 
 
 def test_the_command_writes_a_folder_whose_robot_moves_as_recorded(bag, tmp_path, capsys):
@@ -160,78 +147,6 @@ def test_patterns_and_folders_are_checked(bag, tmp_path):
     (tmp_path / "mine").mkdir()
     with pytest.raises(InputError, match="exists, and is not replaced"):
         twodof.fit(ARM, bag, "payload", output=tmp_path / "mine")
-
-
-# --- robots of example-robot-data ---
-
-UR5 = robots_folder() / "ur_description" / "urdf" / "ur5_robot.urdf"
-
-
-def changed_links(text: str, rng: np.random.Generator) -> str:
-    """A URDF whose masses, centres and inertias are others, each possible."""
-    root = ET.fromstring(text)
-    for inertial in root.iterfind("link/inertial"):
-        factor = rng.uniform(0.8, 1.25)
-        mass, origin, tensor = (inertial.find(tag).attrib for tag in ("mass", "origin", "inertia"))  # type: ignore[union-attr]
-        mass["value"] = repr(factor * float(mass["value"]))
-        place = np.array(origin["xyz"].split(), float) + rng.uniform(-0.02, 0.02, 3)
-        origin["xyz"] = " ".join(map(repr, place.tolist()))
-        for key in tensor:
-            tensor[key] = repr(factor * float(tensor[key]))
-    return ET.tostring(root, encoding="unicode")
-
-
-def test_all_masses_of_a_ur5_that_can_be_seen_are_found(tmp_path):
-    text = UR5.read_text("utf-8")
-    truth = changed_links(text, np.random.default_rng(2))
-    friction = [6.0, 8.0, 4.0, 1.5, 1.0, 1.0]
-    motion = move(mujoco_model(truth, friction=friction), [0, -1.2, 1.2, -0.5, 0.3, 0], 0.9, 30.0)
-    robot = load_robot(text, "tool0", "xyz")
-    bag = bag_of(tmp_path / "bag", robot.joints, *noisy(motion))
-    result = twodof.fit(UR5, bag, ("mass:*", "com:*", "inertia:*", "friction[*]"), output=tmp_path / "fitted")
-    assert result.explains and result.unseen
-    assert not any(p.known for p in result.parameters if p.name.startswith("mass:shoulder_link"))
-    for p in result.parameters:
-        if p.name.startswith("friction"):
-            assert abs(p.after - friction[int(p.name[9]) - 1]) <= 3.0 * p.deviation
-
-    # efforts at random states are those of the truth, within what the fit says of its parameters
-    names = [p.name for p in result.parameters if not p.name.startswith("friction")]
-    values = np.array([p.after for p in result.parameters if p.name in names])
-    count = len(names)
-    covariance = result.covariance[-count:, -count:]
-    rng, exact = np.random.default_rng(5), load_robot(truth, "tool0", "xyz").model
-    states = [rng.uniform(-1.0, 1.0, (3, 6)) for _ in range(30)]
-    steps = 1e-5 * np.eye(count)
-    rates = (efforts(robot, names, values + s, states) - efforts(robot, names, values - s, states) for s in steps)
-    J = np.array([rate / 2e-5 for rate in rates]).T
-    off = efforts(robot, names, values, states) - np.concatenate(
-        [pin.rnea(exact, exact.createData(), *s) for s in states]
-    )
-    seen = np.linalg.svd(J * np.sqrt(np.diag(covariance)), full_matrices=False)
-    for direction in seen[0].T[: np.linalg.matrix_rank(J, 1e-6)]:
-        deviation = np.sqrt(direction @ J @ covariance @ J.T @ direction)
-        assert abs(direction @ off) <= 3.5 * deviation
-
-    fitted = load_robot((tmp_path / "fitted" / "robot.urdf").read_text("utf-8"), "tool0", "xyz").model
-    for _ in range(200):
-        M = pin.crba(fitted, fitted.createData(), rng.uniform(-3.0, 3.0, 6))
-        assert np.linalg.eigvalsh(np.triu(M) + np.triu(M, 1).T)[0] > 0.0
-
-
-def efforts(robot: Any, names: list[str], values: np.ndarray, states: list[np.ndarray]) -> np.ndarray:
-    """Efforts at states, of links with masses, centres and inertias of the given names."""
-    model, given = robot.model.copy(), dict(zip(names, values))
-    for joint in range(1, model.njoints):
-        model.inertias[joint].setZero()
-    for link in {name.partition(":")[2].partition(".")[0] for name in names}:
-        frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
-        com = np.array([given[f"com:{link}.{axis}"] for axis in "xyz"])
-        xx, xy, xz, yy, yz, zz = (given[f"inertia:{link}.{k}"] for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        own = frame.placement.act(pin.Inertia(given[f"mass:{link}"], com, tensor))
-        model.inertias[frame.parentJoint] = model.inertias[frame.parentJoint] + own
-    return np.concatenate([pin.rnea(model, model.createData(), *state) for state in states])
 
 
 def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, tmp_path):
