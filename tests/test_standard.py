@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 import subprocess
 import zipfile
@@ -201,6 +202,80 @@ def test_categories_of_fmi_2_choose_too_and_errors_are_no_debug_logging(fmus: di
         arm.messages.clear()
         arm.setDebugLogging(on, categories)
         assert arm.status("getReal", [0]) == ERROR and len(arm.messages) == count, categories
+    arm.freeInstance()
+
+
+# --- the phases of FMI 3.0.2, sections 2.3, 3.2 and 4.2 ---
+
+PHASES = {"CoSimulation": "INST", "ModelExchange": "INECT"}
+"""Instantiated, initialization, step, event and continuous-time mode, terminated."""
+WAY = {
+    "N": ["enterInitializationMode"],
+    "S": ["exitInitializationMode"],
+    "E": ["exitInitializationMode"],
+    "C": ["updateDiscreteStates", "enterContinuousTimeMode"],
+    "T": ["terminate"],
+}
+"""Calls by the phase to which they lead from the one before."""
+ALLOWED = {
+    "enterInitializationMode": "I",
+    "exitInitializationMode": "N",
+    "terminate": "SEC",
+    "reset": "INSECT",
+    "getFloat64": "INSECT",
+    "setFloat64 of an input": "INSEC",
+    "setFloat64 of a parameter": "IN",
+    "setBoolean": "IN",
+    "getDirectionalDerivative": "NSECT",
+    "getAdjointDerivative": "NSECT",
+    "doStep": "S",
+    "enterEventMode": "C",
+    "updateDiscreteStates": "E",
+    "enterContinuousTimeMode": "E",
+    "completedIntegratorStep": "C",
+    "setTime": "EC",
+    "setContinuousStates": "C",
+    "getContinuousStateDerivatives": "NECT",
+    "getContinuousStates": "NECT",
+    "getEventIndicators": "NECT",
+    "getNumberOfContinuousStates": "INECT",
+    "getNumberOfEventIndicators": "INECT",
+}
+
+
+@pytest.mark.parametrize("kind", PHASES)
+def test_every_call_of_fmi_3_in_every_phase(fmus: dict[int, Path], kind: str, tmp_path: Path) -> None:
+    arm = made(fmus, (3, kind), tmp_path)
+    vr = {name: [reference] for name, reference in arm.vr.items()}
+    along = vr["tau"], vr["x_des"], [1.0, 0.0], 2
+    arguments: dict[str, tuple[Any, ...]] = {
+        "getFloat64": (vr["tau"], 2),
+        "setFloat64 of an input": (vr["x_des"], [0.1, 0.2]),
+        "setFloat64 of a parameter": (vr["rtol"], [0.02]),
+        "setBoolean": (vr["limit_effort"], [True]),
+        "getDirectionalDerivative": along,
+        "getAdjointDerivative": along,
+        "doStep": (0.0, 0.01),
+        "setTime": (0.0,),
+        "getEventIndicators": ((ctypes.c_double * 7)(), 7),
+    }
+    states = (ctypes.c_double * 4)(), 4
+    for name in ("setContinuousStates", "getContinuousStates", "getContinuousStateDerivatives"):
+        arguments[name] = states
+    offered = [call for call in ALLOWED if hasattr(arm, call.split()[0])]
+    for phase in PHASES[kind]:
+        for call in WAY.get(phase, ()):
+            getattr(arm, call)()
+        state = arm.getFMUState()
+        allowed = set()
+        for call in offered:
+            arm.messages.clear()
+            status = arm.status(call.split()[0], *arguments.get(call, ()))
+            assert status == OK or (status, len(arm.messages)) == (ERROR, 1), (phase, call)
+            allowed |= {call} if status == OK else set()
+            arm.setFMUState(state)
+        assert allowed == {call for call in offered if phase in ALLOWED[call]}, phase
+        arm.freeFMUState(state)
     arm.freeInstance()
 
 
