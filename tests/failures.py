@@ -106,6 +106,29 @@ FAILURES = {
         ("sampling",),
         "too high for control_period = 0.004 s, control_delay = 0.03 s",
     ),
+    "a slow controller with limited motors": Failure(
+        "ur5",
+        "joint",
+        {
+            "control_period": 0.08,
+            "Kp": 300.0,
+            "Kd": 35.0,
+            "limit_effort": True,
+            "q_des": (0.2, -1.1, 1.5, 0.3, -0.9, 0.4),
+        },
+        ("sampling", "saturation"),
+        "too high for control_period = 0.08 s",
+    ),
+    "a stiff law without damping": Failure(
+        "ur5",
+        "joint",
+        {"Kp": 8000.0, "Kd": 0.5, "q_des": (0.2, -1.1, 1.5, 0.3, -0.9, 0.4)},
+        ("damping",),
+        "Kd[1] = 0.5 s⁻¹ damps Kp[1] = 8000 s⁻² too little",
+    ),
+    "a load that presses a leg to a limit": Failure(
+        "a1", "task", {"Kp": 30.0, "Kd": 11.0, "payload": 5.0}, ("load", "limit"), "the payload of 5 kg"
+    ),
     "a coarse encoder": Failure(
         "arm",
         "joint",
@@ -132,8 +155,8 @@ FAILURES = {
         "ur5",
         "joint",
         {"payload": 5.0, "Kp": 2.0, "q_max": (6.0, -1.1, 1.6, 6.0, 6.0, 6.0)},
-        ("limit", "load"),
-        "stood at its upper limit",
+        ("load", "limit"),
+        "the payload of 5 kg",
     ),
     "out of reach and slow": Failure(
         "panda",

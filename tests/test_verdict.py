@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from failures import FAILURES, ROBOTS, Failure, fmu_of, good_runs
 from scipy.optimize import brute, differential_evolution
+from scipy.spatial.transform import Rotation
 from sinks import Memory
 
 import twodof
@@ -40,6 +41,34 @@ def test_the_first_line_names_the_cause_of_a_failure(failed: tuple[Failure, Path
     assert failure.words in verdict.lines[0]
     assert verdict.causes[0].kind == failure.kinds[0]
     assert {*failure.kinds} <= {cause.kind for cause in verdict.causes}
+
+
+@pytest.mark.parametrize(
+    ("name", "cured", "same"),
+    [
+        ("a slow controller with limited motors", {"control_period": 0.0}, {"limit_effort": False}),
+        ("a stiff law without damping", {"Kd": 180.0}, {"max_step": 0.001}),
+        ("a load that presses a leg to a limit", {"payload": 0.0}, {"q_min": -20.0, "q_max": 20.0}),
+        ("a load and a joint at its limit", {"payload": 0.0}, {"q_min": -20.0, "q_max": 20.0}),
+        ("a joint in the way", {"q_min": -20.0}, {"payload_known": True}),
+    ],
+)
+def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], same: dict[str, Any]) -> None:
+    """And without another cause that the verdict might name first, it still fails."""
+    failure = FAILURES[name]
+    settings = [{**failure.settings, **change} for change in (cured, same)]
+    outcomes = [failures.run(failure._replace(settings=each)).verdict.outcome for each in settings]
+    assert outcomes == ["reached", "not reached"]
+
+
+def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:
+    """While the damping of a Panda's joints, which the controller does not know, disturbs it."""
+    settings = {"x_des": (0.4, 0.2, 0.6), **failures.LARGE_STEPS}
+    kept = Kept()
+    verdict = twodof.simulate(fmu_of("panda", "pose"), kept, settings=settings, stop_time=4.0).verdict
+    a, b = (Rotation.from_quat(quat) for quat in (kept.samples[-1].quat, kept.samples[-1].target_quat))
+    assert 1e-4 < (a.inv() * b).magnitude() < 1e-3
+    assert verdict.outcome == "reached" and not verdict.causes
 
 
 def test_a_bag_a_figure_and_a_page_say_the_same(

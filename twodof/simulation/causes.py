@@ -19,11 +19,11 @@ KINDS = {
     "reach": "the target is out of reach",
     "gain": "a gain of 0",
     "feedforward": "a target that rests, with a target velocity or acceleration",
+    "sampling": "an oscillation as fast as the steps of controller or communication",
     "limit": "a joint at its position limit",
     "friction": "a joint that sticks",
     "saturation": "a motor at its effort limit",
     "load": "a load that the controller does not know",
-    "sampling": "an oscillation as fast as the steps of controller or communication",
     "damping": "too little damping",
     "singularity": "a singular pose",
     "time": "gains that are too slow for the duration",
@@ -87,10 +87,12 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     if missed:
         found += _damping(judge, ["x", "quat"] if motion in ("oscillating", "diverging") else missed)
     order, motors = [*KINDS], max((cause.share for cause in found if cause.kind == "saturation"), default=0.0)
+    driven = _driven(judge)
 
-    def rank(cause: Cause) -> tuple[int, bool, float]:
-        passing = cause.kind == "limit" and cause.share < motors  # a joint in the way saturates motors no longer
-        return order.index("saturation" if passing else cause.kind), passing, -cause.share
+    def rank(cause: Cause) -> tuple[int, float]:
+        # a joint in the way saturates motors no longer
+        passing = cause.kind == "limit" and (cause.share < motors or cause.joint in driven)
+        return order.index("drag" if passing else cause.kind), -cause.share
 
     return tuple(sorted(found, key=rank)[:MOST])
 
@@ -196,6 +198,17 @@ def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
                 yield Cause("limit", text, counts[i] / judge.count, joint, float(t[inside[:, i].argmax()]))
 
 
+def _driven(judge: Judge) -> set[str]:
+    """Return the joints that the controller pulls away from the nearer limit at the end: another cause drives them."""
+    setup, q = judge.setup, judge.end("q")
+    pull = judge.wanted("q") - q if judge.wanted("q").size else np.zeros(len(q))
+    if _chain(judge) and not judge.wanted("quat").size:
+        jacobian = setup.kinematics.jacobian(setup.frame, q[None])[0, setup.rows]
+        pull = np.linalg.pinv(jacobian, NEAR_SINGULAR) @ (judge.wanted("x") - judge.end("x"))
+    above = np.abs(q - setup.high) < np.abs(q - setup.low)
+    return {joint for joint, away in zip(setup.joints, np.where(above, pull < 0.0, pull > 0.0)) if away}
+
+
 def _chain(judge: Judge) -> list[Joint]:
     """Return the joints that move the end effector; empty if they are unknown."""
     robot, frame = judge.setup.robot, judge.setup.frame
@@ -251,12 +264,13 @@ def _load(judge: Judge) -> Iterator[Cause]:
 
 def _sampled(judge: Judge) -> Iterator[Cause]:
     v, setup = judge.tail("v")[-256:], judge.setup
-    if len(v) < 16:
+    sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
+    continuous = bool(judge.aims) and not any(sampling) and judge.changes <= MANY_CHANGES
+    if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
         return
     turns = (np.sign(v[1:]) * np.sign(v[:-1]) < 0.0).mean(axis=0)
     turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
     i = int(turns.argmax())
-    sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
     if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
         gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
         what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"

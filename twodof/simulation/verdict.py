@@ -17,6 +17,7 @@ from .motion import motion_of
 from .setup import Array, Setup
 
 OF_THE_END = 0.1  # last fraction of a run, in which a moving target still changes and an error must stay in its band
+HELD = 1e-3  # m, rad: a smaller error of an output that is held, and that only falls, is no failure
 FOLLOWED = 0.1  # fraction of the target's travel: with a larger RMS error in the second half, a target is not followed
 
 
@@ -202,7 +203,8 @@ def _missed(judge: Judge) -> list[str]:
     missed, t = [], judge.history()
     for name, aim in judge.aims.items():
         late = judge.error_history(name)[t >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)]
-        if max(aim.last, late.max(initial=0.0)) > max(BAND * aim.first, FLOOR):
+        held = aim.first <= FLOOR and (np.diff(late) <= 0.0).all()
+        if max(aim.last, late.max(initial=0.0)) > max(BAND * aim.first, HELD if held else FLOOR):
             missed.append(name)
     return missed
 
