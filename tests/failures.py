@@ -52,6 +52,13 @@ FAILURES = {
         ("time",),
         "the orientation still approaches",
     ),
+    "a slow orientation of five joints": Failure(
+        "so100",
+        "pose",
+        {"x_des": (0.168754, -0.165877, 0.205062), "quat_des": (-0.323431, 0.840547, 0.43215, 0.046039), "Kp_rot": 1.0},
+        ("time",),
+        "the orientation still approaches",
+    ),
     "a saturated motor": Failure(
         "ur5", "joint", {"payload": 40.0, "payload_known": True, "limit_effort": True}, ("saturation",), "saturated at"
     ),

@@ -50,6 +50,7 @@ def test_the_first_line_names_the_cause_of_a_failure(failed: tuple[Failure, Path
         ("a stiff law without damping", {"Kd": 180.0}, {"max_step": 0.001}),
         ("a load that presses a leg to a limit", {"payload": 0.0}, {"q_min": -20.0, "q_max": 20.0}),
         ("a load and a joint at its limit", {"payload": 0.0}, {"q_min": -20.0, "q_max": 20.0}),
+        ("a slow orientation of five joints", {"Kp_rot": 50.0}, {"payload_known": True}),
         ("a joint in the way", {"q_min": -20.0}, {"payload_known": True}),
     ],
 )

@@ -305,9 +305,10 @@ def _damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 def _singular(judge: Judge) -> Iterator[Cause]:
     setup, q, t = judge.setup, judge.history("q"), judge.history()
-    if not _chain(judge) or len(setup.axes) + 3 * bool(judge.wanted("quat").size) > len(setup.joints):
-        return
     rows = [*setup.rows, *((3, 4, 5) if judge.wanted("quat").size else ())]
+    moving = {joint.leader for joint in _chain(judge)} & {*setup.joints}
+    if len(rows) > len(moving):  # singular everywhere
+        return
     sigma = np.linalg.svd(setup.kinematics.jacobian(setup.frame, q)[:, rows], compute_uv=False)
     ratio = sigma[:, -1] / np.maximum(sigma[:, 0], 1e-300)
     near = max(NEAR_SINGULAR, 2.0 * float(setup.starts.get("rcond", 0.0)))
