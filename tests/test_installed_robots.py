@@ -68,6 +68,8 @@ def test_a_list_without_robots_says_how_to_have_them(
 def test_a_robot_that_is_unknown_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["build", "--robot", "pandda"]) == 1
     assert "there is no robot 'pandda'; did you mean 'panda'?" in capsys.readouterr().err
+    with pytest.raises(twodof.TwoDofError, match="no robot 'ur5'; did you mean 'ur5_robot'"):
+        twodof.stock_robot("ur5")
     assert main(["build", "arm.urdf", "--robot", "panda"]) == 2
     with pytest.raises(twodof.TwoDofError, match="q_start: there is no joint 'joint3'; did you mean 'joint2'"):
         twodof.build_fmu("new.fmu", twodof.FmuOptions(q_start={"joint3": 1.0}))

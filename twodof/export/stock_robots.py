@@ -50,7 +50,9 @@ def stock_robot(name: str) -> FmuOptions:
     """
     known = stock_robots()
     if name not in known:
-        raise BuildError(f"there is no robot '{name}'{choice(name, known) if known else f'; {SOURCE}'}")
+        begun = [each for each in known if each.startswith(name)]  # ur5_robot for ur5, which resembles ur3
+        remedy = choice(name, begun, 0.0) if begun else choice(name, known) if known else f"; {SOURCE}"
+        raise BuildError(f"there is no robot '{name}'{remedy}")
     path = known[name]
     try:
         urdf = read_urdf(read_text(path, None))
