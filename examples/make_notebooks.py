@@ -149,7 +149,7 @@ computed, last = run(lambda q, v: pin.rnea(model, data, q, v, 60 * (goal - q) - 
 last""",
     """## Against a plain PD
 
-Without the model gravity pulls the arm off its goal, by the torque over the gain.""",
+Without the model, gravity holds the arm away from its goal, by its torque divided by the gain.""",
     """plain, last = run(lambda q, v: 4.0 * (goal - q) - 0.4 * v, "plain")
 print(goal - computed.q[-1], "rad by inverse dynamics")
 print(goal - plain.q[-1], "rad by the PD alone")""",
@@ -158,8 +158,8 @@ print(goal - plain.q[-1], "rad by the PD alone")""",
 GAINS = (
     """# Gains
 
-A sweep runs an FMU at many gains, on all cores, and judges each run like an engineer: settling, overshoot, effort
-against the limits of the URDF. It needs `pip install '.[native,sweep,view]'`.""",
+A sweep runs an FMU at many gains, on all cores, and evaluates each run: settling, overshoot, and effort
+relative to the limits of the URDF. It needs `pip install '.[native,sweep,view]'`.""",
     """%matplotlib inline
 import twodof""",
     """fmu = twodof.build_fmu("TwoDof.fmu", twodof.FmuOptions(native=True))
@@ -168,7 +168,7 @@ table = twodof.sweep(fmu, grid=grid, stop_time=3, output="gains", bags=True)
 table""",
     """## The best run by your own cost
 
-Names are the table's columns; pandas sorts them.""",
+The cost is an expression of the table's columns, which pandas evaluates.""",
     """table["cost"] = table.eval("settling_time + 0.1 * peak_effort")
 table.sort_values("cost")[["Kp", "Kd", "cost", "settling_time", "overshoot", "peak_effort", "effort_use"]].head()""",
     """## The map
@@ -207,7 +207,7 @@ K = np.linalg.solve(R, model.B.T @ P)
 K.round(3)""",
     """## In closed loop with the full plant
 
-From 0.1 rad off, at 1 ms.""",
+The arm starts 0.1 rad from upright; a step is 1 ms.""",
     """start = {"q_start": (upright[0] + 0.1, -0.1)}
 source = twodof.samples(fmu, step=0.001, stop_time=3.0, settings=start)
 sample, trace = next(source), []
