@@ -170,7 +170,7 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
 
     bags = [bag("real", last), bag("model", 0.1)]
     assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0
-    said = f"; cannot be told from 'real': a is not finite at {2 * STEP / 1e9:g} s\n"
+    said = f"; cannot be compared with 'real': a is not finite at {2 * STEP / 1e9:g} s\n"
     assert said in capfd.readouterr().out
 
 
@@ -191,6 +191,6 @@ def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path: Path, capfd: 
 
     bags = [bag("real", 101, STEP, 0.0), bag("model", 80, 3 * STEP, 0.25)]
     assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0
-    text = "0.25 off 'real' at most, b at 1 s; RMS 0.145"
+    text = "at most 0.25 from 'real', b at 1 s; RMS 0.145"
     assert f"; {text}\n" in capfd.readouterr().out
     assert text in html.unescape((tmp_path / "both.html").read_text())

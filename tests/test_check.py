@@ -149,7 +149,7 @@ def test_an_undeclared_dependency_fails(tmp_path: Path) -> None:
     described = DESCRIPTION.replace('<Unknown index="4"/></InitialUnknowns>', '<Unknown index="4" dependencies="2"/>')
     described = described.replace('dependencies="2"/>', 'dependencies="2"/></InitialUnknowns>')
     texts = failed(twodof.check(foreign(tmp_path, description=described)))
-    assert texts == {"inputs": "y depends on u, and its InitialUnknown does not state it"}
+    assert texts == {"inputs": "y depends on u, and its InitialUnknown does not declare it"}
 
 
 def test_what_the_description_does_not_claim_does_not_apply(tmp_path: Path) -> None:

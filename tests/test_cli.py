@@ -160,7 +160,7 @@ def test_default_run_builds_the_fmu_again_only_if_it_differs(folder: Path, capfd
 
     first, content = run("one"), fmu_file.read_bytes()
     assert run("two") == first
-    said = "no FMU is named: this is TwoDof.fmu, the default planar arm\n"
+    said = "no FMU is named: using TwoDof.fmu, the default planar arm\n"
     assert capfd.readouterr().err == 2 * said
     assert main(["build", "--q-start", "0.1", "0.2"]) == 0
     other = fmu_file.read_bytes()

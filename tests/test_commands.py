@@ -62,8 +62,8 @@ NAMES = ("joint1", "joint2")
 @pytest.mark.parametrize(
     ("control", "cdr", "kind", "text"),
     [
-        ("joint", joint_state(("elbow",), (0.1,)), "names", "of no joint of this robot: 'elbow'"),
-        ("joint", joint_state(), "names", "of no joint of this robot: ''"),
+        ("joint", joint_state(("elbow",), (0.1,)), "names", "names no joint of this robot: 'elbow'"),
+        ("joint", joint_state(), "names", "names no joint of this robot: ''"),
         ("joint", joint_state(NAMES, (0.1,)), "sizes", "has 1 positions for 2 joints"),
         ("joint", joint_state(NAMES, (), (1.0, 1.0)), "sizes", "has 0 positions for 2 joints"),
         ("joint", joint_state(NAMES, (0.1, 0.1), (1.0,)), "sizes", "has 1 velocities for 2"),

@@ -95,5 +95,5 @@ def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path: Path,
             assert sorted(data for _, _, data in reader.messages()) == sorted(data for _, _, data in messages[0])
         assert np.array_equal(twodof.read_bag(bags[1]).q, twodof.read_bag(bags[0]).q)
         assert twodof.recover(bags[1]).original is None
-    with pytest.raises(twodof.TwoDofError, match="`compress` is of mcap"):
+    with pytest.raises(twodof.TwoDofError, match="`compress` applies to storage mcap only"):
         twodof.Bag(tmp_path / "new", storage="sqlite3", compress="zstd")

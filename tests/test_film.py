@@ -96,7 +96,7 @@ def test_what_makes_no_film_is_said(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     for name, more, words in (
         ("run.avi", [], "the name of an export ends in .html, .mp4, .webp, .gif, .png"),
-        ("run.mp4", ["--fmu", "a.fmu"], "a film shows the arm as lines: --fmu, of its meshes, has no effect"),
+        ("run.mp4", ["--fmu", "a.fmu"], "a film shows the arm as lines, without meshes; leave out --fmu"),
         ("run.mp4", [], "cannot write"),
     ):
         assert main(["view", str(bag), "--export", str(tmp_path / name), *more]) == 1

@@ -75,7 +75,7 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(tmp_
     "options, message",
     [
         (FmuOptions(platforms=("win64",)), "for the native flavour only"),
-        (FmuOptions(native=True, link_environment=True), "needs no environment to link"),
+        (FmuOptions(native=True, link_environment=True), "needs no Python environment"),
     ],
 )
 def test_options_that_do_not_fit_a_flavour_are_refused(options, message, tmp_path):

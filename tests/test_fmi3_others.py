@@ -118,7 +118,7 @@ def test_its_bag_and_what_is_said_of_it(oscillators, tmp_path, capsys):
     assert re.search(r"w2\[2\] +4, 9 +parameter\n", said)
     for refused, reason in (
         (["page", str(oscillators), "-o", str(tmp_path / "a.html")], "has no plant in C"),
-        (["linearise", str(oscillators)], "gives no derivatives"),
+        (["linearise", str(oscillators)], "has no directional derivatives"),
         (["live", str(oscillators), "--no-browser"], "contains no robot"),
     ):
         assert main(refused) == 1

@@ -106,7 +106,7 @@ def test_a_folder_that_could_not_be_locked_is_never_taken_for_abandoned(tmp_path
 def test_no_place_for_temporary_folders_is_told(monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
-    with pytest.raises(OSError, match=r"'/nowhere'.*; TMPDIR names one"):
+    with pytest.raises(OSError, match=r"'/nowhere'.*; name one in TMPDIR"):
         temporary_folder().__enter__()
 
 

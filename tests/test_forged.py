@@ -31,10 +31,10 @@ def forged(fmu: Path, folder: Path, pattern: str, text: str) -> Path:
 @pytest.mark.parametrize(
     ("pattern", "text", "culprit"),
     [
-        ('axes="xy"', 'axes="xw"', "its axes 'xw' are not different ones of 'xyz'"),
+        ('axes="xy"', 'axes="xw"', "its axes 'xw' must be different letters of 'xyz'"),
         ('axes="xy"', 'axes="x"', "x has 2 elements for the axes 'x'"),
         ('axes="xy"', 'axes="xyz"', "x has 2 elements for the axes 'xyz'"),
-        ('axes="xy"', 'axes="xx"', "its axes 'xx' are not different ones of 'xyz'"),
+        ('axes="xy"', 'axes="xx"', "its axes 'xx' must be different letters of 'xyz'"),
         (r'name="x\[', 'name="xx[', "x has 0 elements for the axes 'xy'"),
         (r'name="x_des\[2', 'name="xx_des[2', "x_des has 1 elements for the axes 'xy'"),
         ('frame="EndEffector"', 'frame="Nope"', "it has no link 'Nope'"),

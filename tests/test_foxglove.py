@@ -127,7 +127,7 @@ def test_gains_are_set_where_asked_for_alone(native_path: Path, caplog: pytest.L
             assert ask(connection, {"name": "Kp", "value": 1.0}) == [held]
         assert viewer.command() == taken
     (record,) = caplog.records
-    assert "gains are shown alone; `set_gains=True` lets it" in record.message
+    assert "Foxglove may not set gains; `set_gains=True` allows it" in record.message
 
 
 def test_websites_but_foxgloves_own_are_refused(native_path: Path) -> None:

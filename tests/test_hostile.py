@@ -48,7 +48,7 @@ def test_what_is_no_file_of_bearable_size_is_refused(what: str, kind: str, jail:
         "csv": ["run", native_path, "--input", path, "-o", jail.target / "bag"],
         "mesh": [*build, jail.input / "arm.urdf"],
     }
-    refused(jail, f"mesh .*(not found|leaves its folder|cannot be read)|{reason}", *command[what])
+    refused(jail, f"mesh .*(not found|is outside of its folder|cannot be read)|{reason}", *command[what])
 
 
 # --- FMUs ---

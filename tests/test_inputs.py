@@ -331,8 +331,8 @@ def test_changes_are_named_as_settings_are(fmu: Fmu) -> None:
         ([(0.1, {"x_dse": 1.0})], "there is no variable 'x_dse'"),
         ([(0.1, {"q": 1.0})], r"q\[1\] is of causality 'output'"),
         ([(0.1, {"rtol": 1e-3})], "rtol is no input and cannot be changed at 0.1 s"),
-        ([(0.2, {"Kp": 1.0}), (0.1, {"Kp": 2.0})], "the times of `changes` are finite and ascend"),
-        ([(float("nan"), {"Kp": 1.0})], "the times of `changes` are finite and ascend"),
+        ([(0.2, {"Kp": 1.0}), (0.1, {"Kp": 2.0})], "the times of `changes` must be finite and ascend"),
+        ([(float("nan"), {"Kp": 1.0})], "the times of `changes` must be finite and ascend"),
     ],
 )
 def test_changes_that_cannot_be_are_refused_before_the_run(fmu: Fmu, changes, culprit) -> None:

@@ -108,7 +108,7 @@ def test_names_are_text_and_topics_are_in_the_namespace(
     topics = [d["Value"] for d in dictionaries(YAML(typ="safe").load(rviz)) if "Value" in d]
     assert topics and all(topic.startswith("/left/") for topic in topics)
     for options, culprit in (
-        (["--namespace", "a b"], "--namespace 'a b' is no name of ROS 2"),
+        (["--namespace", "a b"], "--namespace 'a b' is not a valid ROS 2 name"),
         (["-o", str(fmu)], "Odd.fmu': File exists"),
     ):
         assert main(["layouts", str(native_path), *options]) == 1

@@ -68,7 +68,7 @@ def test_an_equilibrium_holds_still(bare):
         ("bare", {"tau_cmd": 90.0}, "there is no equilibrium near q_start = "),
         ("bare", {"Kp": 1.0}, "it belongs to control 'task' or "),
         ("task", {"q": [0.3, 0.8], "rcond": "ratio"}, "jumps here"),
-        ("python", {}, "gives no derivatives; a native FMU does"),
+        ("python", {}, "has no directional derivatives; build a native FMU"),
     ],
 )
 def test_what_has_no_linear_model_is_refused(fmu, at, message, bare, native_path, fmu_path):

@@ -276,7 +276,7 @@ def test_commands_that_mean_nothing_or_are_absurd_end_no_run(
         "has 1 efforts for 2 joints",
         "is not finite",
         "is of joints that this",
-        "is of no joint of this robot: 'elbow'",
+        "names no joint of this robot: 'elbow'",
         "is stamped 8.64e+04 s before the sample",
     ]
     assert len(found) == len(expected)
@@ -406,8 +406,8 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
 @pytest.mark.parametrize(
     ("options", "culprit"),
     [
-        (["--namespace", "a b"], "--namespace 'a b' is no name of ROS 2"),
-        (["--state-topic", "1st"], "--state-topic '1st' is no name of ROS 2"),
+        (["--namespace", "a b"], "--namespace 'a b' is not a valid ROS 2 name"),
+        (["--state-topic", "1st"], "--state-topic '1st' is not a valid ROS 2 name"),
         (["--command-topic", "joint_states"], "--command-topic is '/joint_states', which is publ"),
         (["--clock", "--state-topic", "/clock"], "'/clock' would be two topics"),
         (["--scene", "--state-topic", "tf"], "'/tf' would be two topics"),
@@ -421,7 +421,7 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
         (["--rate", "inf"], "--rate inf"),
         (["--overwrite"], "--overwrite has no effect without -o"),
         (["--stop-time", "0.005"], "the run of 0.005 s is no whole number of steps of 0.01 s"),
-        (["--on-timeout", "hold", "--lockstep"], "--on-timeout is for commands of joints that are"),
+        (["--on-timeout", "hold", "--lockstep"], "--on-timeout applies to joint commands without --lockstep"),
     ],
 )
 def test_options_that_cannot_be(
@@ -435,4 +435,4 @@ def test_options_that_cannot_be(
 
 def test_a_timeout_of_nothing(native_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["publish", str(native_path), "--stop-time", "0.1", "--timeout", "1"]) == 1
-    assert "--timeout is for commands of joints, and for --lockstep" in capfd.readouterr().err
+    assert "--timeout applies to joint commands and to --lockstep only" in capfd.readouterr().err

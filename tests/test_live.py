@@ -496,7 +496,7 @@ def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_p
         quat = page.evaluate("arm.held('quat_des')")
         for i in range(4):
             type_into(page, f"quat_des[{i + 1}], number", 0.0)
-        until(page, lambda said: "quat_des = 0, 0, 0, 0 is no orientation" in said, told)
+        until(page, lambda said: "quat_des = 0, 0, 0, 0 is not an orientation" in said, told)
         left = page.evaluate("arm.held('quat_des')")
         assert left == [0.0, 0.0, 0.0, quat[3]]  # without the last
         latest(command, lambda news: news["noted"] == 1, ["change", {"quat_des": 0}])

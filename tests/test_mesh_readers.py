@@ -61,8 +61,8 @@ def ply(vertices: int) -> bytes:
 
 OFF = b"OFF\n%d %d 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 HOSTILE = {
-    "an instance of itself": (".dae", ITSELF, "it ends its reader: Segmentation fault"),
-    "2^24 instances": (".dae", doubling(24), "it ends its reader: CPU time limit exceeded"),
+    "an instance of itself": (".dae", ITSELF, "it crashes its reader: Segmentation fault"),
+    "2^24 instances": (".dae", doubling(24), "it crashes its reader: CPU time limit exceeded"),
     "a billion vertices": (".ply", ply(10**9), "it takes more than 1024 MiB"),
     "a billion faces": (".off", OFF % (10**9, 10**9), "it takes more than 1024 MiB"),
     "more faces than lines": (".off", OFF % (3, 2 * 10**9), "it takes more than 1024 MiB"),
@@ -97,8 +97,8 @@ def test_few_meshes_may_end_their_reader(caplog: pytest.LogCaptureFixture) -> No
     with Meshes(dict.fromkeys(names, ITSELF).get) as meshes:
         assert not any(meshes.scaled(name, ONE) for name in names)
     texts = [record.getMessage() for record in caplog.records]
-    assert sum("it ends its reader" in text for text in texts) == MAX_FATAL_MESHES
-    assert sum("others end their reader" in text for text in texts) == 50 - MAX_FATAL_MESHES
+    assert sum("it crashes its reader" in text for text in texts) == MAX_FATAL_MESHES
+    assert sum("other meshes crash their reader" in text for text in texts) == 50 - MAX_FATAL_MESHES
 
 
 def test_time_of_a_robots_meshes_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
@@ -168,8 +168,8 @@ FORGED = {
     "a vertex too few": ([head(WHITE), POINTS[24:], TRIANGLE], "answer is invalid"),
     "half a vertex": ([head(WHITE), POINTS[4:], TRIANGLE], "answer is invalid"),
     "no number": ([head(WHITE), np.full(9, np.nan).tobytes(), TRIANGLE], "not finite"),
-    "a flood": ([bytes(10**8)], "ends its reader"),
-    "nothing": ([], "ends its reader"),
+    "a flood": ([bytes(10**8)], "crashes its reader"),
+    "nothing": ([], "crashes its reader"),
 }
 
 

@@ -202,7 +202,7 @@ def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
     assert cut == 0
 
 
-NO_ORIENTATION = "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) is no rotation"
+NO_ORIENTATION = "quat_des = 0, 0, 0, 0 is not an orientation; the identity is (0, 0, 0, 1)"
 
 
 def refused(page: Page, code: str, *arguments: object) -> str:

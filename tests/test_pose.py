@@ -197,7 +197,7 @@ def test_the_error_is_scipys_rotation_vector() -> None:
 @FLAVOURS
 @in_child_process
 def test_a_zero_quaternion_is_refused_wherever_it_would_be_followed(fmus, native: bool) -> None:
-    message = "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) is no rotation"
+    message = "quat_des = 0, 0, 0, 0 is not an orientation; the identity is (0, 0, 0, 1)"
     driver = Driver(fmus["ur10", native].path).initialise()
     assert driver.step(0.0) == 0
     before = driver.get("q", "v", "x", "quat", "omega", "tau")

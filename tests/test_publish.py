@@ -510,7 +510,7 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(
 
 def test_a_robots_name_is_told_as_it_was_given(native_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["publish", f"1={native_path}", "--stop-time", "0.01"]) == 1
-    assert "NAME=FMU '1' is no name of ROS 2" in capsys.readouterr().err
+    assert "NAME=FMU '1' is not a valid ROS 2 name" in capsys.readouterr().err
     run = twodof.experiment(native_path, stop_time=0.1)
-    with pytest.raises(InputError, match="`robots` '1' is no name of ROS 2"):
+    with pytest.raises(InputError, match="`robots` '1' is not a valid ROS 2 name"):
         twodof.publish_together({"1": run})

@@ -398,7 +398,7 @@ def test_damaged_default_fmu_is_built_again(folder: Path, fmu_path: Path, capfd:
     (folder / "TwoDof.fmu").write_bytes(damaged(fmu_path.read_bytes()))
     assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 0
     assert (folder / "TwoDof.fmu").read_bytes() == fmu_path.read_bytes()
-    said = "no FMU is named: this is TwoDof.fmu, the default planar arm\n"
+    said = "no FMU is named: using TwoDof.fmu, the default planar arm\n"
     assert capfd.readouterr().err == said
 
 

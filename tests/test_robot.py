@@ -131,7 +131,7 @@ REFUSED = {
     ),
     "mimic beyond its limits": (
         arm(elbow=elbow(LIMIT + '<mimic joint="shoulder" offset="9"/>')),
-        "'elbow' mimics 'shoulder', but no position of that is within the limits of both",
+        "'elbow' mimics 'shoulder', but no position of 'shoulder' is within the limits of both",
     ),
     "no limit": (arm(elbow=elbow("")), "'elbow' has no <limit>"),
     "no limit, prismatic": (arm(elbow=elbow("", kind="prismatic")), "'elbow' has no <limit>"),
@@ -339,7 +339,7 @@ def test_a_joint_that_its_limits_freeze_is_warned_of(inside: str) -> None:
     loaded = load_robot(arm(elbow=still), "tip", "xyz")
     assert loaded.q_min[1] == loaded.q_max[1]
     (warning,) = loaded.warnings
-    assert "limit are equal or missing, so that nothing moves joint 'elbow'" in warning
+    assert "limits do not allow any motion of joint 'elbow'" in warning
     follower = elbow('<limit effort="7"/><mimic joint="shoulder"/>')
     assert not load_robot(arm(elbow=follower), "tip", "xyz").warnings
 

@@ -135,7 +135,7 @@ def test_which_robot_is_meant_must_be_said(
     assert np.array_equal(read_bag(only.path).q, read_bag(only.address).q)
     alone = twodof.Bag(tmp_path / "alone")
     twodof.simulate(runs(fmus)["left"], alone)
-    with pytest.raises(BagError, match="is of one robot; leave ':left' out"):
+    with pytest.raises(BagError, match="has one robot; leave ':left' out"):
         read_bag(f"{alone.path}:left")
     (alone.path / "run.old.json").write_bytes((alone.path / "run.json").read_bytes())
     assert np.array_equal(read_bag(alone.path).q, read_bag(only.path).q)  # a copy is no robot
@@ -168,7 +168,7 @@ def test_robots_need_names_that_differ(fmus: dict[str, Path], tmp_path: Path, na
     members = [Member(run, [bag.of(name) if name else bag]) for name in names]
     with pytest.raises(BagError, match="need namespaces that differ"):
         simulate_together(members)
-    with pytest.raises(InputError, match="'1st' is no name of ROS 2"):
+    with pytest.raises(InputError, match="'1st' is not a valid ROS 2 name"):
         bag.of("1st")
 
 
@@ -196,7 +196,7 @@ def test_a_robot_that_does_not_begin_costs_no_bag(fmus: dict[str, Path], tmp_pat
 
 
 def test_a_sink_is_of_a_robot_that_there_is(fmus: dict[str, Path]) -> None:
-    with pytest.raises(InputError, match="'lift', and there are the robots left, fleet/right"):
+    with pytest.raises(InputError, match="'lift', but the robots are left, fleet/right"):
         twodof.publish_together(runs(fmus, 0.02), sinks={"lift": []})
 
 

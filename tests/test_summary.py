@@ -146,7 +146,7 @@ def test_a_summary_that_metadata_contradicts_is_told_and_mended(
         stated, held = 12_007, 12_006
     assert main(["info", str(bag)]) == 0
     (line,) = caplog.messages
-    assert f"should have {stated} messages by its metadata.yaml, and has {held} by" in line
+    assert f"has {stated} messages according to its metadata.yaml, and {held} in" in line
     assert f"'twodof recover {bag}'" in line
     assert main(["recover", str(bag)]) == 0
     caplog.clear()

@@ -180,7 +180,7 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kpp=1:2:3"], "there is no variable 'Kpp'; did you mean 'Kp"),
         (["--grid", "q=1:2:3"], "q[1] is of causality 'output' and cannot be set"),
         (["--grid", "Kp=5:1:3"], "LOW 5 must be below HIGH 1"),
-        (["--grid", "Kp=1:2:0"], "COUNT 0 is no whole number from 2 on"),
+        (["--grid", "Kp=1:2:0"], "COUNT 0 must be a whole number of at least 2"),
         (["--grid", "Kp=1:2"], "--grid Kp=1:2: expected NAME=LOW:HIGH:COUNT"),
         (["--grid", "Kp=1:nan:3"], "its numbers must be finite"),
         (["--grid", "Kp=1:2:3", "--grid", "Kp=1:2:3"], "--grid Kp is given twice"),

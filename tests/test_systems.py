@@ -410,7 +410,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     yield "many", ssd(f"<ssd:Elements>{many}</ssd:Elements>"), {}, "more than 100 components"
     deep = '<ssd:System name="s"><ssd:Elements>' * 500 + "</ssd:Elements></ssd:System>" * 500
     yield "deep", ssd(f"<ssd:Elements>{deep}</ssd:Elements>"), {}, "is not valid SSP 1.0"
-    yield "slip", None, {"../out": b""}, "leaves its folder"
+    yield "slip", None, {"../out": b""}, "is outside of its folder"
     units = f"<ssd:Units>{DEGREE}<ssc:Unit name='turn'><ssc:BaseUnit/></ssc:Unit></ssd:Units>"
     for kind, text, message in (
         ("<ssc:Real{}/>", "input deg", r"'pd\.q\[1\]' states the unit 'deg', and its FMU another, 'rad'"),
@@ -428,7 +428,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
         yield f"{name} twice", ssd(parts), {}, r"of 'pd' sets 'Kp' twice"
     yield "no FMU", None, {"resources/pd.fmu": b"PK no zip"}, "resources/pd.fmu' is no FMU"
     slip = zipped({"modelDescription.xml": b"<a/>", "../out": b""})
-    yield "FMU slips", None, {"resources/pd.fmu": slip}, "leaves its folder"
+    yield "FMU slips", None, {"resources/pd.fmu": slip}, "is outside of its folder"
     circle = "".join(
         f'<ssd:System name="{a}">{connectors({"x": "input", "y": "output"})}<ssd:Connections>{connection("x", "y")}'
         "</ssd:Connections></ssd:System>"
@@ -475,7 +475,7 @@ def test_an_fmu_that_is_a_link_is_refused(plant: bytes, pd: bytes, tmp_path: Pat
     link.external_attr = 0o120777 << 16
     with zipfile.ZipFile(system, "a") as archive:
         archive.writestr(link, "/etc/passwd")
-    with pytest.raises(FmuError, match="leaves its folder"):
+    with pytest.raises(FmuError, match="is outside of its folder"):
         twodof.load_fmu(system)
 
 

@@ -40,7 +40,7 @@ def test_settling_is_that_of_the_error(runs: dict[str, Path]) -> None:
     outside = bag.t[distance > 0.02 * distance[0]][-1]
     with pytest.raises(AssertionError) as caught:
         assert_settles(bag, within=outside)
-    (time,) = re.findall(r"settles after ([\d.]+) s, and is to settle within", str(caught.value))
+    (time,) = re.findall(r"settles after ([\d.]+) s, but must settle within", str(caught.value))
     assert 0.0 < float(time) - outside <= 0.0101
     slow = twodof.read_bag(runs["slow"])
     off = float(((slow.x[300] - (0.2, 0.05)) ** 2).sum() ** 0.5)
@@ -77,7 +77,7 @@ def test_what_cannot_be_compared_fails(runs: dict[str, Path]) -> None:
         assert_settles(unknown, within=9.0)
     with pytest.raises(AssertionError, match=r"400 samples in 3\.99 s, and its reference 401 samples in 4 s"):
         assert_equal(shorter, good, within=1.0)
-    with pytest.raises(AssertionError, match="the joints are a, b, and of the reference joint1, joint2"):
+    with pytest.raises(AssertionError, match="the joints are a, b, those of the reference joint1, joint2"):
         assert_equal(dataclasses.replace(good, joints=("a", "b")), good, within=1.0)
 
 
@@ -106,7 +106,7 @@ def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path: Path, native_p
     (tmp_path / "test_arm.py").write_text(TEST.format(fmu=str(native_path)))
     done = pytest_of_a_user(tmp_path, "--twodof-report", "report")
     assert "1 failed, 1 passed" in done.stdout, done.stdout + done.stderr
-    assert "and is to settle within 1 s" in done.stdout
+    assert "but must settle within 1 s" in done.stdout
     (plot,) = (tmp_path / "report").iterdir()
     assert plot.name == "test_arm.py_test_late.html" and str(plot) in done.stdout
     assert plot.read_text().count("<polyline") == 1

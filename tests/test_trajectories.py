@@ -234,8 +234,8 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (trajectory([]), "has no points whose times ascend"),
-        (trajectory([(1.0, *THERE), (1.0, *BACK)]), "has no points whose times ascend"),
+        (trajectory([]), "has no points, or their times do not increase"),
+        (trajectory([(1.0, *THERE), (1.0, *BACK)]), "has no points, or their times do not increase"),
         (trajectory([(1.0, (0.1,))]), "has 1 positions for 2 joints"),
         (trajectory([(1.0, (0.1, 0.1), (0.1,))]), "has 1 velocities for 2 joints"),
         (trajectory([(1.0, (0.1, 0.1), (), (0.1, 0.1))]), "has 0 velocities for 2 joints"),
@@ -243,7 +243,7 @@ NAN = float("nan")
         (trajectory([(1.0, (), (0.1, 0.1))]), "has 0 positions for 2 joints"),
         (trajectory([(1.0, (), (), (), (1.0, 1.0))]), "has 0 positions for 2 joints"),
         (trajectory([(1.0, (0.1, NAN))]), "is not finite"),
-        (trajectory([(1.0, (0.1,))], ["elbow"]), "is of no joint of this robot: 'elbow'"),
+        (trajectory([(1.0, (0.1,))], ["elbow"]), "names no joint of this robot: 'elbow'"),
         (trajectory([(1.0, (0.1, 0.2))], ["joint1"] * 2), "names a joint twice: 'joint1, joint1'"),
         (trajectory([(-1.0, *THERE)], NAMES, BEGIN + SECOND // 2), "ends 1 s before it starts"),
         (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp is 0"),

@@ -96,7 +96,7 @@ def test_other_packages_are_found_in_the_mesh_folder(package: Path, tmp_path: Pa
 
 
 INCLUDE, VALUE = "<xacro:include filename='{}'/>", "<link name='{}'/>"
-READ_ELSEWHERE = "nothing else is read"
+READ_ELSEWHERE = "the only folders that may be read"
 HOSTILE = {
     "include by path": (INCLUDE.format("/etc/passwd"), READ_ELSEWHERE),
     "include upwards": (INCLUDE.format("../../secret.xacro"), READ_ELSEWHERE),

@@ -118,12 +118,12 @@ def _check_member(member: zipfile.ZipInfo) -> None:
     link = stat.S_ISLNK(member.external_attr >> 16)
     outside = name.is_absolute() or ".." in name.parts or "\\" in member.filename
     if link or outside or not member.filename:
-        raise UnsafeArchiveError(f"it is unsafe: its member '{name}' leaves its folder")
+        raise UnsafeArchiveError(f"it is unsafe: its member '{name}' is outside of its folder")
     if len(name.parts) > MAX_FOLDERS_DEEP:
         raise UnsafeArchiveError(f"it is unsafe: its folders are nested deeper than {MAX_FOLDERS_DEEP}")
     if member.compress_type not in METHODS:
         raise UnsafeArchiveError(
-            f"its member '{name}' is compressed by method {member.compress_type}; FMI allows to store and to deflate"
+            f"its member '{name}' is compressed by method {member.compress_type}; FMI allows 'store' and 'deflate' only"
         )
 
 
@@ -220,7 +220,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     try:
         parent = Path(tempfile.gettempdir() if parent is None else parent)
     except FileNotFoundError as error:
-        raise OSError(error.errno, f"{error.strerror}; TMPDIR names one") from error
+        raise OSError(error.errno, f"{error.strerror}; name one in TMPDIR") from error
     for left in parent.glob(f"{TEMPORARY}*"):
         _remove_abandoned(left)
     folder = Path(tempfile.mkdtemp(dir=parent))

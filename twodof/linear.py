@@ -118,7 +118,7 @@ def linearise(
     if isinstance(fmu, System):
         raise InputError(f"'{fmu.path}' is a system, which has no derivatives; linearise the FMU of its plant")
     if not fmu.description.coSimulation.providesDirectionalDerivative or "der(q[1])" not in (fmu.variables):
-        raise InputError(f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`")
+        raise InputError(f"'{fmu.path}' has no directional derivatives; build a native FMU with `native=True`")
     groups = ("der(q[{}])", "der(v[{}])", "q_start[{}]", "v_start[{}]", "q_min[{}]", "q_max[{}]")
     for name in (g.format(i + 1) for i in range(len(fmu.vector("q"))) for g in groups):
         if name not in fmu.variables:

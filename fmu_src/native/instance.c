@@ -58,8 +58,8 @@ static Status check_inputs(Instance *instance)
 #if N_ROWS > N_AXES
     const double *quat = &instance->state.plant.value[QUAT_DES];
     if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
-        return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
-                      " is no rotation");
+        return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is not an orientation; the identity"
+                      " is (0, 0, 0, 1)");
 #else
     (void)instance;
 #endif

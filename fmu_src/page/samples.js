@@ -72,7 +72,7 @@ export class Samples {
     });
     const all = new Map([...this.values, ...pairs]);
     if (this.groups.get("quat_des")?.every((element) => !all.get(element)))
-      throw new Error("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) is no rotation");
+      throw new Error("quat_des = 0, 0, 0, 0 is not an orientation; the identity is (0, 0, 0, 1)");
     return pairs;
   }
 

@@ -145,7 +145,7 @@ export class Verdict {
   gains(missed) {
     const zero = ["Kp", "Kp_rot"].flatMap((group, k) =>
       missed[k] ? this.session.held(group).flatMap((gain, i) => (gain === 0 ? [`${group}[${i + 1}]`] : [])) : []);
-    return zero.length ? [`${zero.join(", ")} = 0: nothing pulls this to its target`] : [];
+    return zero.length ? [`${zero.join(", ")} = 0: the controller does not reduce this error`] : [];
   }
 
   /** Shares of the samples since the last change of the target, and of their last quarter, with a condition. */

@@ -161,7 +161,7 @@ class Tables:
             raise struct.error
         stamps = np.ascontiguousarray(rows[:, STAMP]).view("<i8")[:, 0]
         if stamps.min() < 0:
-            raise DamageError(f"'{path.name}' has a stamp beyond 2262")
+            raise DamageError(f"'{path.name}' has a stamp after the year 2262")
         return Batch(self.channels[channel], stamps, rows[:, MESSAGE_HEAD.size : end])
 
 

@@ -198,7 +198,7 @@ def robot_in(path: Path) -> tuple[Path, str]:
     if name in robots or (not name and len(robots) == 1):
         return folder, name or robots[0]
     if robots == [""]:
-        raise BagError(f"the bag '{folder}' is of one robot; leave ':{name}' out")
+        raise BagError(f"the bag '{folder}' has one robot; leave ':{name}' out")
     choice = ", ".join(f"'{folder}:{robot}'" for robot in robots)
     reason = f"has no robot '{name}'; there are" if name else "is of several robots; give one,"
     raise BagError(f"the bag '{folder}' {reason} {choice}")

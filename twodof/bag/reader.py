@@ -158,8 +158,8 @@ def _check_count(path: Path, count: int) -> None:
     stated = stated_count(path) if path.is_dir() else count
     if stated not in (None, count):
         LOG.warning(
-            f"'{path}' should have {stated} messages by its metadata.yaml, and has {count} by its"
-            f" files; 'twodof recover {path}' counts them"
+            f"'{path}' has {stated} messages according to its metadata.yaml, and {count} in its"
+            f" files; 'twodof recover {path}' corrects this"
         )
 
 

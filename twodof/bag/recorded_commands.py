@@ -64,7 +64,7 @@ def read_commands(
     provenance = read_provenance(*robot_in(path)) if topic is None else {}
     if provenance:
         if KNOWN_UNTIL in provenance:
-            raise InputError(f"'{path}' knows its inputs until {provenance[KNOWN_UNTIL]:g} s only")
+            raise InputError(f"'{path}' has inputs only until {provenance[KNOWN_UNTIL]:g} s")
         start = provenance["start_time"]
         changes = [(t - start, resolve(fmu, values)) for t, values in provenance["input_changes"]]
         return [(-inf, resolve(fmu, _inputs(fmu, provenance["start_values"]))), *changes]

@@ -65,7 +65,7 @@ def recover(path: str | Path) -> Recovered:
             if not files:
                 raise BagError(no_such("bag", bag))
             if len({file.suffix for file in files}) > 1:
-                raise BagError(f"'{bag}' has .mcap and .db3 files; leave those of one kind in it")
+                raise BagError(f"'{bag}' has .mcap and .db3 files; move those of one kind away")
             counts = _counts_if_whole(folder, files)
             if counts is not None:
                 return Recovered(bag, None, counts, "")

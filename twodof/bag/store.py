@@ -57,7 +57,7 @@ class Store:
         if compress not in ("", "zstd"):
             raise BagError(f"`compress` '{compress}' is unknown; there is: zstd")
         if compress and storage != "mcap":
-            raise BagError(f"`compress` is of mcap; a {storage} bag is not compressed")
+            raise BagError(f"`compress` applies to storage mcap only, not to {storage}")
         path = Path(os.path.realpath(path)) if os.path.islink(path) else path  # the link stays
         check_path(path, storage)
         self.path, self.fsync = path, fsync
@@ -81,7 +81,7 @@ class Store:
 
     def _enter(self, part: Part) -> None:
         if self._begun if self._entered else self._names and part.namespace not in self._names:
-            raise BagError(f"the bag '{self.path}' has begun and accepts no further robot")
+            raise BagError(f"the bag '{self.path}' is being written and accepts no further robot")
         names = [part.namespace for part in (*self._parts, part)]
         if len(names) > len(set(names)) or ("" in names and len(names) > 1):
             raise BagError(f"the robots of the bag '{self.path}' need namespaces that differ")
@@ -119,7 +119,7 @@ class Store:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
         if self._ended:
-            raise BagError(f"the bag '{self.path}' is not open: it is a context, 'with bag:'")
+            raise BagError(f"the bag '{self.path}' is not open; open it by 'with bag:'")
 
     def flush(self) -> None:
         """Make the thread store the queue; the first flush starts the thread.

@@ -114,7 +114,7 @@ class Bag(Sink):
 
     def __enter__(self) -> Bag:
         if self._run is None:
-            raise BagError("a bag is given its experiment first: 'with bag.begin(experiment):'")
+            raise BagError("the bag is not open; open it by 'with bag.begin(experiment):'")
         self._queue: deque[bytes] = deque()  # packed numbers of waiting samples
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
         self._verdict: dict[str, object] | None = None

@@ -34,10 +34,12 @@ def add(build: argparse.ArgumentParser) -> None:
     option("--urdf", type=Path, metavar="U", help="another spelling of the URDF argument")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="omit the URDF's meshes from the FMU")
-    frame = option("--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)")
+    frame = option(
+        "--frame", type=not_empty, help="controlled link (EndEffector, or the last link, if there is only one)"
+    )
     completed(frame, links)
     add_lock(build)
-    option("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
+    option("--axes", help="task axes, letters of xyz (xy for the shipped arm, else xyz)")
     option(
         "--gravity",
         nargs=3,
@@ -63,7 +65,7 @@ def add(build: argparse.ArgumentParser) -> None:
     flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
-    flag("--overwrite", help="replace an existing file that is not the default arm's FMU")
+    flag("--overwrite", help="replace an existing file; the default arm's FMU does not need it")
     flag("--link-environment", help="store the path of this Python's packages in the FMU")
     flag("--native", help="build the FMU as compiled C, which needs no Python")
     option(
@@ -75,14 +77,12 @@ def add(build: argparse.ArgumentParser) -> None:
         help="platform of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
         " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
     )
-    option(
-        "--fmi",
-        type=int,
-        choices=(2, 3),
-        help="FMI version of a native FMU (2; 3 on machines without a name in FMI 2.0)",
-    )
+    option("--fmi", type=int, choices=(2, 3), help="FMI version of a native FMU (2; 3 on Linux aarch64)")
     flag("--reference", help="add experiments with reference trajectories, for 'twodof check'")
-    flag("--scalars", help="make each element of a vector a variable in FMI 3, for tools without arrays")
+    flag(
+        "--scalars",
+        help="declare a variable for each element of a vector in FMI 3, for tools that do not support arrays",
+    )
 
 
 def call(options: argparse.Namespace) -> int:

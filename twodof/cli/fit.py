@@ -39,7 +39,9 @@ def add(fit: argparse.ArgumentParser) -> None:
         " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
     )
     add_output(fit, "FOLDER", "folder of the fitted robot (fitted)")
-    frame = option("--frame", type=not_empty, metavar="LINK", help="link of the payload (the only last link)")
+    frame = option(
+        "--frame", type=not_empty, metavar="LINK", help="link of the payload (the last link, if there is only one)"
+    )
     completed(frame, links)
     add_lock(fit)
     option(

@@ -54,18 +54,18 @@ def _default_arm(verb: str, *, native: bool = False) -> Path:
     taken = there if len(there) == 1 else [path for path in there if path.name == own]
     if taken and not is_default_arm(taken[0]):
         raise CommandLineError(
-            f"no FMU is named, and '{taken[0]}' is here, which is not the default arm's:"
+            f"no FMU is named, and '{taken[0]}' is here, which is not the FMU of the default arm:"
             f" type 'twodof {verb} {quote(taken[0])}' to use it, or build the default arm's with"
             f" 'twodof build{' --native' * native} -o arm.fmu'"
         )
     path = _built(native=native)
-    say(f"no FMU is named: this is {path}, the default planar arm", error=True)
+    say(f"no FMU is named: using {path}, the default planar arm", error=True)
     return path
 
 
 def _built(overwrite: bool = False, **what: Any) -> Path:
     robot = what["urdf"].name if what.get("urdf") else "the default arm"
-    with busy(f"building the FMU of {robot}, which a compiler may take a minute for"):
+    with busy(f"building the FMU of {robot}; a compiler may take a minute"):
         from ..export.fmu_options import FmuOptions
         from ..export.package import build_fmu
 

@@ -92,6 +92,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **named: Any) -> None:
         super().__init__(allow_abbrev=False, **named)
+        self._optionals.title = "options (defaults in parentheses)"
 
     def format_help(self) -> str:
         """Return the help with its examples."""

@@ -34,7 +34,7 @@ VERBS = {
     fit: "fit a robot's masses and friction to bags of its motion",
     plot: "draw bags, or the map of a sweep, into one figure",
     view: "replay a bag in the browser",
-    live: "drive an FMU in the browser",
+    live: "run an FMU in the browser and drag its target",
     page: "write a robot as one HTML file that runs",
     sweep: "run an FMU over many gains, and map the results",
     export: "write a bag as a table, or as one MCAP file",
@@ -48,7 +48,7 @@ def parser() -> tuple[Parser, dict[str, Parser]]:
     program = Parser(
         prog="twodof",
         description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
-        epilog="'twodof run' alone builds the default arm's FMU, runs it for 5 s and leaves a bag.",
+        epilog="'twodof run' alone builds the default arm's FMU, runs it for 5 s and writes a bag.",
     )
     program.add_argument("--version", action="version", version=f"twodof {__version__}")
     verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")

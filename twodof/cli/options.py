@@ -37,7 +37,7 @@ def output_file(text: str) -> str:
 Keywords = dict[str, Any]
 Table = dict[str, Keywords]
 OF_A_RUN: Table = {
-    "--native": dict(action="store_true", help="build and run a native FMU, of the URDF or the default arm"),
+    "--native": dict(action="store_true", help="build and run a native FMU of the URDF or of the default arm"),
     "--set": dict(
         dest="settings",
         action="append",
@@ -46,7 +46,8 @@ OF_A_RUN: Table = {
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
     ),
     "--input": dict(
-        metavar="CSV|BAG[:TOPIC]", help="inputs over time: a column 'time' and one for each input; or a bag's commands"
+        metavar="CSV|BAG[:TOPIC]",
+        help="inputs over time: a CSV with a column 'time' and one for each input, or the commands of a bag",
     ),
     "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="storage plugin of the bag (mcap)"),
     "--compress": dict(choices=("zstd",), default="", help="compress the chunks of an MCAP bag"),
@@ -67,7 +68,7 @@ OF_A_PAGE: Table = {
 OPTIONS: Table = {
     "--cost": dict(metavar="EXPRESSION", help="cost that ranks the runs, such as 'settling + 0.1*peak_effort'"),
     "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)"),
-    "--robot": dict(default="", metavar="NAME", help="component of a system whose q and v are the robot's"),
+    "--robot": dict(default="", metavar="NAME", help="robot's component in a system of FMUs"),
     "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's default)"),
     "--namespace": dict(default="", metavar="NS", help="namespace of the topics"),
@@ -120,7 +121,7 @@ def add_lock(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="JOINT[=VALUE]",
-        help="fix joints, names or shell patterns, at a position (0), rad or m",
+        help="joint to fix, a name or shell pattern, and its position, rad or m (0)",
     )
     completed(lock, completion.joints)
 

@@ -23,7 +23,7 @@ def add(plot: argparse.ArgumentParser) -> None:
         " sweep, each metric over the variables."
     )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="bags to draw; several are compared")
-    text = ".png, .svg, .pdf or .html; - is the standard output, as PNG (a window)"
+    text = "file: .png, .svg, .pdf or .html; - is the standard output, as PNG (a window opens)"
     add_output(plot, "FILE", text, output_file)
     chosen = plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     completed(chosen, joints)
@@ -40,7 +40,7 @@ def call(options: argparse.Namespace) -> int:
     sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
     if not sweeps:
         if options.cost is not None:
-            raise CommandLineError("--cost is for a sweep, which none of these is")
+            raise CommandLineError("--cost ranks the runs of a sweep, and there is no sweep here")
         return _plot_bags(options)
     for option in ("joints", "urdf", "frame"):
         if getattr(options, option) is not None:

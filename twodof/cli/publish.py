@@ -24,7 +24,7 @@ def add(publish: argparse.ArgumentParser) -> None:
     publish.description = (
         "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
         " Ctrl-C. Received commands drive the robot: joint states on /joint_commands, or points"
-        " on /target_command and /clicked_point, depending on its control. Honours ROS_DOMAIN_ID,"
+        " on /target_command and /clicked_point, depending on the FMU's control law. Honours ROS_DOMAIN_ID,"
         " ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and CYCLONEDDS_URI."
     )
     option, flag = publish.add_argument, partial(publish.add_argument, action="store_true")
@@ -32,9 +32,9 @@ def add(publish: argparse.ArgumentParser) -> None:
         "robots",
         nargs="*",
         metavar="[NAME=]FMU|URDF",
-        help="default: TwoDof.fmu, built if it is missing; several run in step, each in a namespace",
+        help="default: TwoDof.fmu, built if it is missing; several are stepped together, each in a namespace",
     )
-    add_output(publish, "BAG", "record a bag too, one of all robots")
+    add_output(publish, "BAG", "also record a bag, one for all robots")
     add_options(publish, "--frame")
     option("--stop-time", type=float, metavar="S", help="stop time, s (until Ctrl-C)")
     option("--rate", type=float, default=100.0, metavar="HZ", help="communication steps per second (%(default)g)")
@@ -47,16 +47,20 @@ def add(publish: argparse.ArgumentParser) -> None:
     option(
         "--command-topic",
         metavar="TOPIC",
-        help="topic of received commands (joint_commands or target_command, by the control)",
+        help="topic of received commands (joint_commands or target_command, by the control law)",
     )
-    flag("--lockstep", help="do each step when the command with its stamp has arrived")
+    flag("--lockstep", help="wait before each step for the command with the stamp of the latest state")
     option(
         "--timeout",
         type=float,
         metavar="S",
-        help="time without a command, s, until the robot is held (0.5) or a lockstep run ends (10)",
+        help="time without a command, s, until --on-timeout applies (0.5) or a lockstep run ends (10)",
     )
-    option("--on-timeout", choices=("hold", "ramp"), help="hold the last command (targets), or ramp to zero (efforts)")
+    option(
+        "--on-timeout",
+        choices=("hold", "ramp"),
+        help="at the time-out, hold the last command, or ramp it to zero (hold targets, ramp efforts)",
+    )
     flag("--clock", help="publish /clock, and subscribe to /pause and /step")
     option("--speed", type=float, metavar="FACTOR", help="multiple of real time (1; in lockstep unlimited)")
     add_options(publish, *OF_A_RUN)
@@ -120,7 +124,7 @@ def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
             raise CommandLineError(f"'{given}' names no FMU")
         check_name("robots", name)
         if name in robots:
-            raise CommandLineError(f"two robots are '{name}'; call them NAME={options.fmu}")
+            raise CommandLineError(f"two robots are named '{name}'; give one another name, NAME={options.fmu}")
         run = robots[name] = experiment_of(options, stop_time, 1.0 / options.rate)
         fmus = [robot.fmu for robot in robots.values() if robot.fmu.path == run.fmu.path]
         if any(fmu.members != run.fmu.members for fmu in fmus):

@@ -24,7 +24,7 @@ def call(options: argparse.Namespace) -> int:
         ("bag", f"{done.path} ({sum(done.counts.values())} messages)"),
         *((topic, f"{count}") for topic, count in sorted(done.counts.items())),
         *([("damage", done.damage)] if done.damage else []),
-        ("original", f"{done.original}, as it was; delete it when you are content"),
+        ("original", f"{done.original}, the damaged bag; delete it when the new one is right"),
     )
     print_next(f"twodof info {quote(done.path)}", f"ros2 bag play {quote(done.path)}")
     return 0

@@ -51,7 +51,7 @@ def call(options: argparse.Namespace) -> int:
     from ..simulation.verdict import RESULTS
 
     if options.stop_time == math.inf:
-        raise CommandLineError("stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C")
+        raise CommandLineError("stop time inf s: must be finite; 'twodof publish' runs until Ctrl-C")
     for condition in options.fail_if:
         expression(condition, RESULTS, condition=True)  # checked before a run that may take hours
     run = experiment_of(options, options.stop_time, options.step)

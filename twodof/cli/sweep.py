@@ -184,7 +184,7 @@ def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
     for text in texts:
         name, (low, high, number) = _parse("--grid", text, "NAME=LOW:HIGH:COUNT", grids)
         if number != int(number) or number < 2:
-            raise CommandLineError(f"--grid {text}: COUNT {number:g} is no whole number from 2 on")
+            raise CommandLineError(f"--grid {text}: COUNT {number:g} must be a whole number of at least 2")
         if number > MAX_RUNS:
             raise CommandLineError(f"--grid {text}: COUNT must be at most {MAX_RUNS}")
         grids[name] = tuple(np.linspace(low, high, int(number)).tolist())

@@ -18,7 +18,7 @@ def add(view: argparse.ArgumentParser) -> None:
         "--export",
         type=output_file,
         metavar="FILE",
-        help="write a page, .html, or a film, .mp4, .webp, .gif or .png, instead; - is the standard output",
+        help="write a page (.html), a film (.mp4, .webp, .gif) or a picture (.png) instead; - is the standard output",
     )
     add_robot_options(view)
     view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of the packages or meshes of the URDF")

@@ -265,16 +265,16 @@ def zig_cache() -> Path | None:
         cache.mkdir(mode=0o700, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
         if not _is_ours(cache) or not all(_is_ours(part, 0o002) for part in cache.iterdir()):
-            fault = f"its cache '{cache}', or a part of it, is another user's, or others write to it"
+            fault = f"other users own its cache '{cache}' or a part of it, or can write there"
     except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
         if named:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BuildError(
-                f"zig's cache cannot be '{named}': {reason}; ZIG_GLOBAL_CACHE_DIR names its folder"
+                f"zig cannot use the cache '{named}' of ZIG_GLOBAL_CACHE_DIR: {reason}; name another folder"
             ) from error
         fault = f"it has no folder for its cache ({error})"
     if fault:
-        LOG.warning("zig compiles the C library each time: %s; ZIG_GLOBAL_CACHE_DIR names another folder", fault)
+        LOG.warning("zig compiles the C library each time: %s; name another folder in ZIG_GLOBAL_CACHE_DIR", fault)
         return None
     return cache
 

@@ -93,10 +93,10 @@ def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str
             )
         return python_flavour(options, robot, urdf, starts)
     if options.link_environment:
-        raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
+        raise BuildError("a native FMU needs no Python environment; leave out `link_environment=True`")
     fmi = options.fmi or (2 if options.platforms or host_platform() else 3)
     if fmi not in PLATFORMS:
-        raise BuildError(f"there is no FMI {fmi} here, `fmi` is 2 or 3")
+        raise BuildError(f"`fmi` {fmi} must be 2 or 3")
     platforms = options.platforms or (host_platform(fmi),)
     if platforms == ("",):
         other = ", or `fmi` 3, which has one" if host_platform(3) else ""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from ..plant.variables import DISTURBANCES, Variable
 
 TERMINALS = {
-    "targets": "where the robot is meant to be, or the effort of a controller",
+    "targets": "targets of the robot, or efforts of a controller",
     "joints": "positions, velocities and efforts of the joints",
-    "forces": "what acts on the robot from outside",
+    "forces": "external forces and torques on the robot",
 }
 
 

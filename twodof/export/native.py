@@ -15,7 +15,7 @@ from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_INTEGER": "seed", "FIRST_BOOLEAN": "v_from_q"}
 """First group of each part of the table: outputs, parameters, and among these integers and Booleans."""
 INDICATORS = "event_indicators"
-SIGNS = "change their sign where a joint meets or leaves a stop, or J⁺ its rank"
+SIGNS = "change sign where a joint reaches or leaves a stop, or the rank of J⁺ changes"
 
 
 def model_header(

@@ -54,8 +54,8 @@ def end_effector(urdf: Urdf, frame: str | None) -> str:
         raise RobotError("there is no link that a joint moves; `lock` fewer joints")
     others = [link for link in urdf.links if link not in leaves]
     raise RobotError(
-        f"name the controlled link with `frame`; at the ends are: {', '.join(leaves)};"
-        f" and there are: {', '.join(others)}"
+        f"name the controlled link with `frame`; last links are: {', '.join(leaves)};"
+        f" other links are: {', '.join(others)}"
     )
 
 
@@ -92,7 +92,7 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
         if joint.leader in positions:
             positions.setdefault(name, joint.ratio * positions[joint.leader] + joint.offset)
         elif name in positions:
-            raise RobotError(f"joint '{name}' mimics '{joint.leader}', which moves: lock that")
+            raise RobotError(f"joint '{name}' mimics '{joint.leader}', which moves: lock '{joint.leader}'")
     for name, value in positions.items():
         joint, element = moving[name], elements[name]
         if not joint.low <= value <= joint.high:

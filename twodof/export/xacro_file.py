@@ -79,7 +79,7 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, se
     except Exception as error:
         raise BuildError(f"cannot expand '{path}': {_reason(error)}") from None
     if len(text) > most:
-        raise BuildError(f"'{path}' expands to {len(text)} bytes, at most {most}")
+        raise BuildError(f"'{path}' expands to {len(text)} bytes; at most {most} are supported")
     pipe.send((text, remarks.getvalue()))
 
 
@@ -93,7 +93,7 @@ def _reason(error: Exception) -> str:
     if isinstance(cause, ArgException):
         return (
             f"its argument '{cause}' has no default; expand it by the command xacro, which takes"
-            " arguments, and build what it makes"
+            " arguments, and build the result"
         )
     if isinstance(cause, OSError) and cause.filename is not None:
         return f"'{cause.filename}' cannot be read: {cause.strerror}"
@@ -151,10 +151,12 @@ def _guard(folders: Sequence[Path], most: int) -> Any:
             path = Path(os.path.realpath(arguments[0]))
             if not any(path.is_relative_to(folder) for folder in folders):
                 where = " or ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
-                raise PermissionError(errno.EACCES, f"it is not in {where}, and nothing else is read", str(path))
+                raise PermissionError(
+                    errno.EACCES, f"it is not in {where}, the only folders that may be read", str(path)
+                )
             if event == "open":
                 if arguments[1] not in ("r", "rb"):
-                    raise PermissionError(errno.EACCES, "nothing is written", str(path))
+                    raise PermissionError(errno.EACCES, "a xacro file may not write", str(path))
                 check_file(path, most)
         elif event not in ALLOWED:
             raise RuntimeError(f"a xacro file may not do that ({event})")

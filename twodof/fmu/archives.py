@@ -48,7 +48,7 @@ def read_archive(path: Path, inside: str) -> tuple[bytes, dict[str, int]]:
         raise FmuError(f"'{where}': {error}") from error
     except ZIP_ERRORS as error:
         other = kind_of(path) not in ("", "FMU", "system")
-        why = f"'{where}' is no FMU: it is not a sound zip archive ({error})"
+        why = f"'{where}' is no FMU: it is not a valid zip archive ({error})"
         raise FmuError(no_such("FMU", path) if other else why) from error
     if not is_plain_xml(xml):
         raise FmuError(f"'{where}': modelDescription.xml declares entities or is not UTF-8")

@@ -246,7 +246,7 @@ def logged(fmu: Fmu) -> Fmu:
     if len(fmu.joints) != n:
         raise FmuError(f"'{fmu.path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):
-        raise FmuError(f"'{fmu.path}': its axes '{fmu.axes:.50}' are not different ones of 'xyz'")
+        raise FmuError(f"'{fmu.path}': its axes '{fmu.axes:.50}' must be different letters of 'xyz'")
     for group in ("x", "x_des") if fmu.axes else ():
         names = fmu.vector(group)
         if len(names) != len(fmu.axes) and (names or group == "x"):
@@ -310,7 +310,7 @@ def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
         return
     starts: list[str | None] = [*(variable.start or "").split()] or [None]
     if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
-        raise FmuError(f"{variable.name} has {len(starts)} start values, not one or one an element")
+        raise FmuError(f"{variable.name} has {len(starts)}start values; expected one, or one for each element")
     inner = re.fullmatch(r"der\((.*)\)", variable.name)
     for i, indices in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
         index = f"[{','.join(map(str, indices))}]"

@@ -150,7 +150,7 @@ class _Files:
         start, stop, step = (float(times.get(f"{key}", 0.0)) for key in ("startTime", "stopTime", "stepSize"))
         count = (stop - start) / step if step > 0.0 else 0.0
         if not 0.5 < count < MOST_STEPS:
-            raise ValueError(f"experiment '{experiment.get('name')}' is no run of whole steps, at most {MOST_STEPS}")
+            raise ValueError(f"experiment '{experiment.get('name')}' must be a run of at most {MOST_STEPS} whole steps")
         return Reference(
             *(experiment.get("name", ""), start, stop, step, float(times.get("tolerance", "nan"))),
             parameters={} if parameters is None else self.parameters(parameters.get("source", "")),

@@ -138,13 +138,13 @@ def inputs(trial: Trial) -> str:
                 if before != after and trial.variables[name] not in stated.get(
                     trial.variables[output], [trial.variables[name]]
                 ):
-                    raise SimulationError(f"{output} depends on {name}, and its InitialUnknown does not state it")
+                    raise SimulationError(f"{output} depends on {name}, and its InitialUnknown does not declare it")
             trial.begin_again(instance)
             trial.rows(instance, 1)
             trial.note(f"a change of {name}")
             instance.set(changed)
             trial.rows(instance, 1, 1)
-    return f"{len(trial.inputs)} inputs; outputs depend on no others than they state"
+    return f"{len(trial.inputs)} inputs; outputs depend only on those that they declare"
 
 
 def call_order(trial: Trial) -> str:

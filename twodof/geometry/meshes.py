@@ -145,7 +145,7 @@ class Meshes:
         fresh = kind not in self._readers
         while True:
             if self._fatal >= MAX_FATAL_MESHES:
-                raise _KilledError(f"{MAX_FATAL_MESHES} others end their reader")
+                raise _KilledError(f"{MAX_FATAL_MESHES} other meshes crash their reader")
             before, left = _time_of_children(), int(MAX_MESHES_SECONDS - self._spent)
             if kind not in self._readers:
                 if left < 1:
@@ -160,7 +160,7 @@ class Meshes:
                 self._spent += _time_of_children() - before
                 if fresh:
                     self._fatal += 1
-                    raise _KilledError(f"it ends its reader: {error}") from None
+                    raise _KilledError(f"it crashes its reader: {error}") from None
                 fresh = True
 
 

@@ -167,7 +167,7 @@ class _Gains(ServerListener):
         for parameter in parameters:
             try:
                 if not self._control:
-                    raise InputError("gains are shown alone; `set_gains=True` lets it")
+                    raise InputError("Foxglove may not set gains; `set_gains=True` allows it")
                 if parameter.name not in self._groups:
                     raise InputError(f"'{parameter.name:.80}' is no gain of this FMU")
                 asked = resolve(self._fmu, {parameter.name: _numbers(parameter.get_value())})

@@ -197,7 +197,7 @@ def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotO
     if suffix in FILMS:
         useless = [name for name in ("mesh_dir", "fmu") if robot.get(name) is not None]
         if useless:
-            raise PageError(f"a film shows the arm as lines: `{useless[0]}`, of its meshes, has no effect")
+            raise PageError(f"a film shows the arm as lines, without meshes; leave out `{useless[0]}`")
         from ..plots.film import film  # Matplotlib takes half a second to import
 
         film(bag, path, urdf=robot.get("urdf"), frame=robot.get("frame"))

@@ -300,7 +300,7 @@ class Plant(ControlledPlant):
 
     def _check_target(self) -> None:
         if self.control == "pose" and not any(self.quat_des):
-            raise DiscardError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) is no rotation")
+            raise DiscardError("quat_des = 0, 0, 0, 0 is not an orientation; the identity is (0, 0, 0, 1)")
 
     def _check_parameters(self) -> None:
         try:

@@ -103,12 +103,12 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     bodies = {joint.child: _mass(urdf, joint, odd) for joint in urdf.joints.values() if joint.moves}
     warnings = list(urdf.warnings)
     if empty := ", ".join(f"'{link}'" for link, mass in bodies.items() if not mass):
-        warnings.append(f"moving links without mass are used as they are: {empty}")
+        warnings.append(f"these moving links have no mass:  {empty}")
     if odd:
         links = ", ".join(f"'{link}'" for link in dict.fromkeys(odd))
         warnings.append(
-            "no body can have these inertias, one principal moment larger than the sum of the"
-            f" other two, which are taken as they are: {links}"
+            "no body can have these inertias: one principal moment is larger than the sum of the"
+            f" other two; they are used unchanged: {links}"
         )
     if not bodies:
         raise RobotError("the URDF has no moving joint")
@@ -175,7 +175,8 @@ def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
         low, high = max(low, min(ends)), min(high, max(ends))
         if low > high:
             raise RobotError(
-                f"joint '{joint.name}' mimics '{leader.name}', but no position of that is within the limits of both"
+                f"joint '{joint.name}' mimics '{leader.name}', but no position of '{leader.name}' is"
+                " within the limits of both"
             )
     return low, high
 
@@ -262,6 +263,6 @@ def _check_mass_matrix(robot: Robot) -> None:
         if not np.linalg.eigvalsh(block)[0] > 1e-12 * np.trace(block):
             raise RobotError(
                 f"joint '{robot.joints[i]}': the links behind it have no mass or no inertia about"
-                " its axis, so its acceleration is not defined; give them an <inertial> with those"
-                " of the part, or lock the joint with `lock`"
+                " its axis, so its acceleration is not defined; give them the <inertial> of"
+                " the real part, or lock the joint with `lock`"
             )

@@ -146,8 +146,8 @@ def read_urdf(text: str) -> Urdf:
     warnings = []
     if frozen := [n for n, joint in joints.items() if joint.leader == n and joint.low == joint.high]:
         warnings.append(
-            "lower and upper limit are equal or missing, so that nothing moves"
-            f" {_listed('joint', frozen)}: give limits, or type 'continuous' for none"
+            "equal or missing lower and upper limits do not allow any motion of"
+            f" {_listed('joint', frozen)}: give limits, or type 'continuous'"
         )
     return Urdf(tree.get("name", ""), root, tuple(links), joints, tree, tuple(warnings))
 

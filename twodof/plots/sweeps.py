@@ -83,7 +83,7 @@ def drawing(table: pandas.DataFrame, name: str, cost: Expression | None = None, 
     varied = [*design["grids"], *design["ranges"]]
     best = ranked(table, cost)
     if best.empty:
-        raise PlotError(f"'{name}' has no run that was finished")
+        raise PlotError(f"'{name}' has no finished run")
     shown = {"run": "run", **{name: f"{name}{_in(table.attrs['units'][name])}" for name in varied}}
     known = [key for key in METRICS if table[key].notna().any()]
     shown |= {key: f"{METRICS[key].title}{_in(METRICS[key].unit)}" for key in known}

@@ -264,7 +264,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.linalg.norm(x - target, axis=1)
         if not np.isfinite(x).all() or np.isinf(error).any():
-            raise ValueError("positions or targets are beyond all bounds")
+            raise ValueError("positions or targets are too large to draw")
         first = bag.schedule[0][1]
         turns = "quat_des[1]" in first
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance

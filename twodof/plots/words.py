@@ -70,7 +70,7 @@ def outcome(track: Track) -> list[str]:
     task = track.task
     if task is None or task.off is None:
         return [*track.verdict.lines]
-    return [*track.verdict.lines, f"at most {task.off.max():.1g} m off the closed form"]
+    return [*track.verdict.lines, f"at most {task.off.max():.1g} m from the closed form"]
 
 
 def difference(first: Track, other: Track) -> str:
@@ -87,14 +87,14 @@ def difference(first: Track, other: Track) -> str:
                 off = np.abs(joint.q[both] - np.interp(t, other.t, positions[joint.name]))
             if (lost := ~np.isfinite(off)).any():
                 lost_at = f"{joint.name} is not finite at {number(t[lost.argmax()])} s"
-                return f"cannot be told from '{first.name}': {lost_at}"
+                return f"cannot be compared with '{first.name}': {lost_at}"
             found.append((joint, off))
     if not found:
         return ""
     joint, off = max(found, key=lambda each: float(each[1].max()))
     size = f"{off.max():.3g} {joint.unit}".strip()
-    where = f"at most, {joint.name} at {number(t[off.argmax()])} s"
-    return f"{size} off '{first.name}' {where}; RMS {np.sqrt(np.mean(off**2)):.3g}"
+    where = f"{joint.name} at {number(t[off.argmax()])} s"
+    return f"at most {size} from '{first.name}', {where}; RMS {np.sqrt(np.mean(off**2)):.3g}"
 
 
 def summary(track: Track, first: Track | None = None) -> dict[str, str]:

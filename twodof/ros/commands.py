@@ -83,7 +83,7 @@ def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[
     known = [(joints[name], k) for k, name in enumerate(names) if name in joints]
     listed = f"{', '.join(names)[:LONGEST_NAME]!r}"
     if not known:
-        raise CommandError("names", f"is of no joint of this robot: {listed}")
+        raise CommandError("names", f"names no joint of this robot: {listed}")
     if len(dict(known)) < len(known):
         raise CommandError("names", f"names a joint twice: {listed}")
     return known

@@ -130,7 +130,7 @@ class Listener:
             for command, writer in self._come(name, read, WHAT[kind]):
                 self._commanders.note(self._readers[name], writer, sample.t)
                 if command.unknown_joints:
-                    reason = f"a command on {name} is of joints that this robot has not"
+                    reason = f"a command on {name} names joints that this robot does not have"
                     names = ", ".join(command.unknown_joints)[:LONGEST_NAME]
                     self._warn("unknown_joints", f"{reason}, {names!r}: they are left out")
                 yield command

@@ -88,7 +88,7 @@ def check_name(argument: str, name: str) -> None:
         InputError: the name is invalid; the message names the argument.
     """
     if name and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
-        raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
+        raise InputError(f"`{argument}` '{name}' is not a valid ROS 2 name")
 
 
 class Topic(NamedTuple):

@@ -103,7 +103,7 @@ class Network(NamedTuple):
                 with socket.socket(fileno=os.dup(number)) as one:
                     one.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, attached)
         except OSError as error:
-            raise PublishError(f"cannot keep to {self.reach}: {error.strerror}") from error
+            raise PublishError(f"cannot limit the network to {self.reach}: {error.strerror}") from error
 
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
         """Return the configuration of Cyclone DDS, equivalent to that of rmw_cyclonedds of Jazzy.

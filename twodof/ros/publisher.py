@@ -108,9 +108,9 @@ class Publisher(Sink):
             ramp = None if self._on_timeout is None else self._on_timeout == "ramp"
             self._watchdog = Watchdog(run.fmu, self._timeout or TIMEOUT, ramp)
         elif not of_joints and self._timeout is not None and not self.lockstep:
-            raise InputError("`timeout` is for commands of joints, and for `lockstep`")
+            raise InputError("`timeout` applies to joint commands and to `lockstep` only")
         elif self._on_timeout is not None:
-            raise InputError("`on_timeout` is for commands of joints that are not in `lockstep`")
+            raise InputError("`on_timeout` applies to joint commands without `lockstep` only")
         self._subscribed = {}
         self._begun = self._answered = False
         if self._follows.type:
@@ -122,11 +122,11 @@ class Publisher(Sink):
             raise InputError(f"'{run.fmu.path}' has no inputs that `command_topic` could command")
         self.commands = tuple(self._subscribed)
         for both in {*self.commands} & {*self.topics}:
-            raise InputError(f"`command_topic` is '{both}', which is published")
+            raise InputError(f"`command_topic` '{both}' is a topic that the run publishes; choose another")
         named = [*self.topics, *self.commands, *(ORDERS if self._clock else ())]
         for name in named:
             if named.count(name) > 1:
-                raise InputError(f"'{name}' would be two topics; name `state_topic` or `command_topic` otherwise")
+                raise InputError(f"'{name}' would be two topics; rename `state_topic` or `command_topic`")
         return self
 
     def _named(self, name: str) -> str:

@@ -100,7 +100,7 @@ def publish_together(
     if not robots:
         raise InputError("there are no robots to publish")
     for name in sinks.keys() - robots.keys():
-        raise InputError(f"`sinks` has '{name}', and there are the robots {', '.join(robots)}")
+        raise InputError(f"`sinks` names '{name}', but the robots are {', '.join(robots)}")
     if len(robots) > 1 and str(options.get("state_topic", "")).startswith("/"):
         raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
     for name in robots:

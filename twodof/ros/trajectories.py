@@ -81,10 +81,10 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
     stamp = _nanoseconds(message.header.stamp) or came
     times = [stamp + _nanoseconds(point.time_from_start) for point in message.points]
     if not times or any(late <= early for early, late in pairwise(times)):
-        raise CommandError("times", "has no points whose times ascend")
+        raise CommandError("times", "has no points, or their times do not increase")
     if times[-1] < came:
         late = f"{(came - times[-1]) / NANOSECONDS:.3g} s before it starts"
-        raise CommandError("stamp", f"ends {late}; its stamp is 0, or by the clock of the bag")
+        raise CommandError("stamp", f"ends {late}; its stamp must be 0 or of the bag's clock")
     points = []
     for point in message.points:
         count = 3 if len(point.accelerations) else 2 if len(point.velocities) else 1

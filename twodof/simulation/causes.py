@@ -166,7 +166,7 @@ def _gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     for group in ("Kp_rot" if name == "quat" else "Kp" for name in missed):
         zero = [f"{group}[{i + 1}]" for i, gain in enumerate(judge.given(group)) if gain == 0.0]
         if zero:
-            yield Cause("gain", f"{', '.join(zero)} = 0: nothing pulls this to its target", 1.0)
+            yield Cause("gain", f"{', '.join(zero)} = 0: the controller does not reduce this error", 1.0)
 
 
 def _feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -274,7 +274,7 @@ def _sampled(judge: Judge) -> Iterator[Cause]:
     if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
         gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
         what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
-        often = f"turns round every {setup.step / turns[i]:.2g} s"
+        often = f"reverses every {setup.step / turns[i]:.2g} s"
         text = f"joint '{setup.joints[i]}' {often}: the gains{gains} are too high for {what}"
         yield Cause("sampling", text, float(turns[i]), setup.joints[i])
 

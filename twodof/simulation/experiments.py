@@ -176,7 +176,7 @@ def _due(fmu: Fmu, changes: Iterable[tuple[float, Mapping[str, Setting]]]) -> de
         reason = f"`changes` is {changes!r:.50}; give times with their inputs, as [(0.5, {{'Kp': 80}})]"
         raise InputError(reason) from error
     if not all(earlier <= t < inf for (earlier, _), (t, _) in pairwise([(-inf, {}), *asked])):
-        raise InputError("the times of `changes` are finite and ascend")
+        raise InputError("the times of `changes` must be finite and ascend")
     return deque((t, _inputs_at(fmu, t, inputs)) for t, inputs in asked)
 
 

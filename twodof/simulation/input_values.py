@@ -30,7 +30,7 @@ def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Valu
             raise InputError(f"{name} = {value:g} is less than 0")
     turn = fmu.vector("quat_des")
     if turn and not any({**held, **asked}[name] for name in turn):
-        raise InputError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) is no rotation")
+        raise InputError("quat_des = 0, 0, 0, 0 is not an orientation; the identity is (0, 0, 0, 1)")
 
 
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:

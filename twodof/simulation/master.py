@@ -230,7 +230,7 @@ def simulate(
     """
     run = as_experiment(run, options)
     if other := next((sink for sink in sinks if not isinstance(sink, Sink)), None):
-        raise TypeError(f"a sink is an object of a Sink, such as twodof.Bag('my_bag'), not {other!r}")
+        raise TypeError(f"a sink is an instance of Sink, such as twodof.Bag('my_bag'), not {other!r}")
     bars = (Progress(),) if in_notebook() else ()
     member = Member(run, (*sinks, *bars), steer, resume, instance)
     return simulate_together([member], pace=pace, stop=stop)[0]

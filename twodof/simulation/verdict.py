@@ -66,7 +66,9 @@ METRICS: Mapping[str, Metric] = {
     "effort_use": Metric(
         "peak |τ| / limit", "", "largest |τ_i| as a share of the URDF's effort limit; above 1 the robot cannot do it"
     ),
-    "velocity_use": Metric("peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; likewise"),
+    "velocity_use": Metric(
+        "peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; above 1 the robot cannot do it"
+    ),
     "saturated": Metric(
         "saturation", "", "share of the samples at which |τ_i| is at the URDF's effort limit, of the joint with most"
     ),

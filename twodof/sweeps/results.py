@@ -227,7 +227,7 @@ def _named(path: Path) -> Path:
     try:
         path.as_posix().encode()
     except UnicodeEncodeError as error:
-        raise SweepError(f"'{path}' is no name in UTF-8, which a sweep's has to be") from error
+        raise SweepError(f"'{path}' is not UTF-8 text, which the name of a sweep must be") from error
     return path
 
 

@@ -47,7 +47,7 @@ def assert_settles(run: Recording | str | Path, *, within: float) -> None:
         curves = bag.x - bag.target if bag.target.size and bag.x.size else bag.held("q_des", bag.q.shape[1]) - bag.q
         error = (curves**2).sum(axis=1) ** 0.5
         k = min(int(bag.t.searchsorted(within)), len(error) - 1)
-        text = f"the run {took}, and is to settle within {within:g} s; at {bag.t[k]:.6g} s its error is {error[k]:.3g}"
+        text = f"the run {took}, but must settle within {within:g} s; at {bag.t[k]:.6g} s its error is {error[k]:.3g}"
         _fail(bag, f"{text}; {verdict}", [error], "distance from the target")
 
 
@@ -104,7 +104,7 @@ def assert_equal(run: Recording | str | Path, reference: Recording | str | Path,
     __tracebackhide__ = True
     bag, other = _recording(run), _recording(reference)
     if bag.joints != other.joints:
-        _fail(bag, f"the joints are {', '.join(bag.joints)}, and of the reference {', '.join(other.joints)}", [])
+        _fail(bag, f"the joints are {', '.join(bag.joints)}, those of the reference {', '.join(other.joints)}", [])
     if len(bag.t) != len(other.t) or not np.array_equal(bag.t, other.t):
         spans = (f"{len(each.t)} samples in {each.t[-1]:.6g} s" for each in (bag, other))
         _fail(bag, "the run has {}, and its reference {}".format(*spans), [])
