@@ -1,4 +1,4 @@
-"""Measure fits: how often the 95 % intervals hold the truth, and how near hidden values are found.
+"""Measure fits: how often the 95 % intervals contain the true values.
 
     python benchmarks/fit.py [SEEDS]         the default arm, 60 s, by seeds of the noise (200), about 3 minutes
 

@@ -1,4 +1,4 @@
-"""What `max_step` costs and gives on robots of one's own: the reason for its default of 1 ms.
+"""Measure the error and the cost of `max_step` on chosen robots: the reason for its default of 1 ms.
 
     python benchmarks/largest_step.py [ROBOT …]      about a minute for panda, ur5_robot and kinova
 

@@ -1,4 +1,4 @@
-"""The guide's program as it is written, without its ROS 2 node. Do not use it: it is wrong.
+"""The tutorial's program as it is written, without its ROS 2 node. Do not use it: it is wrong.
 
 It is here so that the benchmark can measure it. Its two mistakes are kept, and marked: the
 Jacobian is taken in the frame of the end effector although the error is in that of the world,

@@ -1,4 +1,4 @@
-"""Bags, written with samples that no simulation gave and read by other readers than the package's.
+"""Writers of bags with artificial samples, and independent readers of bags.
 
 Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
 """

@@ -1,4 +1,4 @@
-"""Runs that fail on purpose, with the causes that they were made with; and runs that do well."""
+"""Runs that fail on purpose, with their causes, and runs that succeed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joints with friction and stops, event by event, by Pinocchio and SciPy: what the plant is compared with.
+"""Event-driven reference solution of joints with friction and stops, by Pinocchio and SciPy.
 
 It shares no code with the plant. In a mode each joint slips in a direction, rests by its friction, or rests at a stop;
 DOP853 integrates the motion in it up to the first event, and the next mode is the one, of all that there are for the

@@ -1,4 +1,4 @@
-"""Recordings of a robot by MuJoCo, with masses, friction and a payload that its URDF does not tell."""
+"""Recordings of a robot by MuJoCo, with masses, friction and a payload that its URDF does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fast DDS nodes and ``twodof publish`` in processes of their own, and what a bag has to say of it.
+"""Fast DDS nodes and ``twodof publish`` in processes of their own, and the messages of a bag.
 
 The nodes are another maker's DDS, with an IDL of its own; bags are read by the MCAP project's
 reader. All stays on the loopback interface, or in network namespaces that lead nowhere.

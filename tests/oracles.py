@@ -1,4 +1,4 @@
-"""Closed forms that the tests compare with; none of them comes from the package."""
+"""Closed forms with which tests compare, independent of the package."""
 
 from __future__ import annotations
 

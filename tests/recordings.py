@@ -1,4 +1,4 @@
-"""Bags for figures: of runs with their samples, and as other recorders write them."""
+"""Bags for figures: of runs with their samples, and in the form of other recorders."""
 
 from __future__ import annotations
 

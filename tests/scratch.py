@@ -1,4 +1,4 @@
-"""A temporary folder for each run of the tests: whatever a test leaves in it fails the run."""
+"""A temporary folder for each run of the tests; a file that a test leaves there fails the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sinks of a run: what it gives, and the memory that it takes."""
+"""Sinks that keep the samples of a run, or measure its memory."""
 
 from __future__ import annotations
 

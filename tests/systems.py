@@ -1,4 +1,4 @@
-"""SSP files for tests, and a controller FMU in C that is not of this package."""
+"""SSP files for tests, and a third-party controller FMU in C."""
 
 from __future__ import annotations
 

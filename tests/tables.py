@@ -1,4 +1,4 @@
-"""Sweeps, and their tables by another reader of Parquet."""
+"""Tables of sweeps, read by an independent reader of Parquet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rooms of the package: who imports whom, which library is where, and how long things are."""
+"""The rooms of the package: imports, third-party libraries, and limits of length."""
 
 from __future__ import annotations
 

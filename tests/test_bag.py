@@ -1,4 +1,4 @@
-"""Bags, read back by readers and compared with truths that this package did not write.
+"""Bags, read by independent readers and compared with independent results.
 
 Readers are rosbags', the MCAP project's own and the standard library's sqlite3; the end effector's
 path is a closed form; type hashes are those that ROS 2 publishes.

@@ -1,4 +1,4 @@
-"""Commands of bags replayed into an FMU; bags of others are written by rosbags."""
+"""Commands of bags replayed into an FMU; rosbags writes the third-party bags."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_points(native_path: Path, tmp_path: Path) -> None:
             None,
             "the command at 0 s is not finite",
         ),
-        ([("/a", BEGIN, joint_message(0, ["elbow"], (), (), (1.0,)))], None, "of no joint of this"),
+        ([("/a", BEGIN, joint_message(0, ["elbow"], (), (), (1.0,)))], None, "names no joint of this"),
     ],
 )
 def test_what_cannot_be_replayed(

@@ -1,4 +1,4 @@
-"""Links in an untrusted bag, which would show or copy any file of this machine."""
+"""Links in an untrusted bag, by which it could read or copy any file of this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags of names that are no plain text: read, or refused before they are written."""
+"""Bags whose names are not plain text: read, or refused before they are written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bag while it is written: where, how it ends early, and what it takes."""
+"""A bag while it is written: location, early ends, memory and disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of the benchmarks besides times: all engines compute the same."""
+"""Results of the benchmarks other than times: all engines compute the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot's constants in frames and bodies of our choice, beside Pinocchio."""
+"""A robot's constants in Denavit-Hartenberg frames, compared with Pinocchio."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The FMU's files: description, digest, reproducibility, and what depends on what."""
+"""The FMU's files: description, digest, reproducibility, and dependencies of variables."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""An FMU that is checked: of this project, and of another maker with one fault at a time."""
+"""Checks of FMUs of this project, and of a third-party FMU with one fault at a time."""
 
 from __future__ import annotations
 

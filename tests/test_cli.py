@@ -1,4 +1,4 @@
-"""The command line where all is well: what it prints, and what it leaves."""
+"""The command line without errors: its output and its files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiling: what is refused, what is kept, and libraries for two processors in one file."""
+"""Compiling: refusals, the cache, and libraries for two processors in one file."""
 
 from __future__ import annotations
 

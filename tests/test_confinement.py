@@ -1,4 +1,4 @@
-"""A confined child: its parser keeps what it was given, and has nothing else of the system."""
+"""A confined child process can use the files that it was given, and nothing else of the system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control laws, payload, forces and rigid stops, in both flavours, against what is not ours."""
+"""Control laws, payload, forces and rigid stops in both flavours, against independent results."""
 
 from __future__ import annotations
 

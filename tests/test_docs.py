@@ -1,4 +1,4 @@
-"""The documentation does what it says: its commands and programs run, its links lead somewhere.
+"""The commands and programs of the documentation run, and its links exist.
 
 A page is run as one shell script, from top to bottom, in a folder that holds nothing but an
 environment ``.venv``, which is this one. What is run are blocks fenced as ``sh`` and ``python``;

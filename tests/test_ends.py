@@ -1,4 +1,4 @@
-"""Every end of a run is a clean end: signals, a full disk, a folder or a reader that goes."""
+"""A run ends cleanly after signals, on a full disk, and when its folder or reader disappears."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags for other programs: tables and single files, as other readers find them; and chunks that are compressed."""
+"""Exports of bags as tables and single files, by independent readers; compressed chunks."""
 
 from __future__ import annotations
 

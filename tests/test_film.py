@@ -1,4 +1,4 @@
-"""The film of a bag: by other readers, FFmpeg's and Pillow's, and the arm where the bag has it."""
+"""Films of bags, read by FFmpeg and Pillow: the arm is where the bag has it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fits to recordings by MuJoCo, which has masses, friction and a payload that the URDF does not tell."""
+"""Fits to recordings by MuJoCo, with masses, friction and a payload that the URDF does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FMUs of FMI 3.0 that others made: run, shown, swept and published as ours are."""
+"""Third-party FMUs of FMI 3.0: run, shown, swept and published like those of this project."""
 
 from __future__ import annotations
 

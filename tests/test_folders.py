@@ -1,4 +1,4 @@
-"""Temporary folders of runs: removed at the end, or by the next run; nobody else's."""
+"""Temporary folders of runs: removed at the end or by the next run; other folders stay."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""A run served to Foxglove, as the client of its own viewer sees it."""
+"""A run served to Foxglove, received by the client of Foxglove's own viewer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Untrusted files that mean harm, made by hand: a command refuses them with one clear line, or
+"""Malicious files, made by hand: a command refuses them with one clear line, or
 reads them for what they hold, in bounded time and memory."""
 
 from __future__ import annotations

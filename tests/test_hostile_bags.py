@@ -1,4 +1,4 @@
-"""Untrusted bags that take much, made by hand: read or refused in bounded time and memory.
+"""Malicious bags, made by hand: read or refused in bounded time and memory.
 
 MCAP files are made record by record after the specification. What is refused for what it says is
 tested in test_records.py.

@@ -1,4 +1,4 @@
-"""FMUs in importers of others, beside FMPy."""
+"""FMUs in third-party importers other than FMPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layouts for RViz, PlotJuggler and Foxglove: what they name is what a run says.
+"""Layouts for RViz, PlotJuggler and Foxglove name the topics and fields that a run publishes.
 
 The tools themselves are not here: their files are read by parsers of YAML, XML and JSON, and each
 topic and field in them is looked for in a bag.

@@ -1,4 +1,4 @@
-"""Linear models: of closed forms, at equilibria, and what has none."""
+"""Linear models: against closed forms, at equilibria, and refusals."""
 
 import json
 import re

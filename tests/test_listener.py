@@ -1,4 +1,4 @@
-"""Robots in the loop of a controller in C++ on Fast DDS, under its clock, and paused.
+"""Robots in closed loop with a controller in C++ on Fast DDS: lockstep, clock and pause.
 
 Truth is the loop closed in Python by the same equation, and the bag read by the MCAP project.
 """

@@ -1,4 +1,4 @@
-"""A live arm, driven and seen in a browser. Truth is the closed form, and other readers of bags."""
+"""A live arm, controlled and seen in a browser, against the closed form and other readers of bags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop behind a live page, without one: orders, news, and what ends a recording."""
+"""The loop of a live page, without the page: requests, updates, and ends of a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes of a URDF: where they are looked for, how they are named, and what is refused."""
+"""Meshes of a URDF: the folders that are searched, names in the FMU, and refusals."""
 
 from __future__ import annotations
 

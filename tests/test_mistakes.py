@@ -1,4 +1,4 @@
-"""Mistakes as people make them: each message names the culprit and a remedy that works."""
+"""Common mistakes of users: each message names the culprit and a remedy that works."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native libraries for every platform: what they contain, their runs, how they are built."""
+"""The native libraries for every platform: their symbols, their runs, and their builds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A long bag that is read for drawing: few samples, and nothing that a picture shows is lost."""
+"""Downsampling of a long bag for drawing keeps everything that a picture shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are written: whole or not at all, where a link leads, with the umask's mode."""
+"""Output files are written completely or not at all, through links, with the mode of the umask."""
 
 from __future__ import annotations
 

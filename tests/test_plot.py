@@ -1,4 +1,4 @@
-"""The figure of runs by what its artists hold: against the FMU's own samples and closed forms."""
+"""The artists of a figure of runs, against the FMU's own samples and closed forms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plots in files, windows and notebooks, what a reader sees there, and the command."""
+"""Plots in files, windows and notebooks, their legibility, and the command."""
 
 from __future__ import annotations
 

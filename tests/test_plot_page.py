@@ -1,4 +1,4 @@
-"""A page of runs: what plotly is given, and what a browser makes of it."""
+"""Interactive pages of runs: the data for plotly, and the page in a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of other robots and of third-party bags: against Pinocchio, and what is refused."""
+"""Figures of other robots and of third-party bags, against Pinocchio; refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""However a run is driven, its bag tells what drove it: distance and closed form by that alone."""
+"""The bag of a run records all of its inputs; distance and closed form follow from them alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run on the publisher, heard and steered by Fast DDS: another maker's DDS, with an IDL of its own.
+"""A published run, received and commanded by a node on Fast DDS with an IDL of its own.
 
 Truth is the bag that is recorded at the same time, read by the MCAP project's reader. All stays on
 the loopback interface, or in network namespaces that lead nowhere.

@@ -1,4 +1,4 @@
-"""The hosts and nodes that a published run obeys: two network namespaces, and two controllers."""
+"""The hosts and nodes that can command a published run: two network namespaces, and two controllers."""
 
 from __future__ import annotations
 

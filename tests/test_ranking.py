@@ -1,4 +1,4 @@
-"""Errors and exceeded limits of a run, and the runs of a sweep that may be called best."""
+"""Errors and exceeded limits of a run, and the ranking of a sweep's runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that mean harm: refused in one line, or read for what they hold.
+"""Bags with malicious records: refused in one line, or read correctly.
 
 MCAP files are made record by record after the specification. What they may cost in time and memory
 is tested in test_hostile_bags.py.

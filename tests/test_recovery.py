@@ -1,4 +1,4 @@
-"""Bags whose writer died: what survives, and what makes them whole again."""
+"""Bags whose writer died: the messages that are saved, and the recovered bag."""
 
 from __future__ import annotations
 

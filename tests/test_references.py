@@ -1,4 +1,4 @@
-"""References that an FMU carries: their form, and what they catch."""
+"""Reference trajectories in an FMU: their form, and the faults that they detect."""
 
 from __future__ import annotations
 

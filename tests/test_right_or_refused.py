@@ -1,4 +1,4 @@
-"""Steps across singularities and stops: right or refused, with what SciPy says as the truth.
+"""Steps across singularities and stops are right, compared with SciPy, or refused.
 
 The oracle integrates the equations of motion, written here with Pinocchio and NumPy, from one event
 to the next: SciPy's ``solve_ivp`` at a tight tolerance, with the joints at limits and the number of

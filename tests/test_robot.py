@@ -1,4 +1,4 @@
-"""The robot: what is refused, by name, and what is accepted and how it is read."""
+"""URDFs: refusals with the culprit's name, and how accepted elements are read."""
 
 from __future__ import annotations
 

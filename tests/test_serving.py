@@ -1,4 +1,4 @@
-"""The server of a page: whom it answers, and what it refuses."""
+"""The server of a page: requests that it answers or refuses."""
 
 from __future__ import annotations
 

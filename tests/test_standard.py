@@ -1,4 +1,4 @@
-"""FMI to the letter: starts of the state, calls in their phases, logging, references, sources."""
+"""Details of the FMI standard: start values, phases of calls, logging, value references, sources."""
 
 from __future__ import annotations
 

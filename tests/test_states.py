@@ -1,4 +1,4 @@
-"""Random programs of calls: every state that an FMU reaches is that of its history alone.
+"""Random programs of calls: each state of an FMU depends on its history alone.
 
 A program sets, steps, saves, restores, serialises, frees, resets and reads, and makes calls that
 are refused. What has been set and stepped since the last initialisation is its history: a straight

@@ -1,4 +1,4 @@
-"""All robots of example-robot-data: their engines are C that compiles, and docs name those."""
+"""All robots of example-robot-data: their generated C compiles, and the documentation lists them."""
 
 from __future__ import annotations
 

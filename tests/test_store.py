@@ -1,4 +1,4 @@
-"""One bag of several robots: each robot's part is what a bag of it alone would be."""
+"""One bag of several robots: each robot's part equals a bag of that robot alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""C without loops from calculations, beside the same calculations over numbers."""
+"""Straight-line C, compared with the same calculation over numbers."""
 
 from __future__ import annotations
 

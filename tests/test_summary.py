@@ -1,4 +1,4 @@
-"""The summary at the end of an MCAP file: believed where its checksum and its numbers are right."""
+"""The summary of an MCAP file is used only if its checksum and its numbers are right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps: the metrics against closed forms, the design, and what becomes of each run."""
+"""Sweeps: metrics against closed forms, the design, and the outcome of each run."""
 
 from __future__ import annotations
 

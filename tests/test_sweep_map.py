@@ -1,4 +1,4 @@
-"""The map of a sweep by what it draws, and what is said of its best runs."""
+"""The content of a sweep's map, and the report of its best runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of a sweep: what is in it, what is resumed, and what is refused."""
+"""The table of a sweep: content, resumption and refusals."""
 
 from __future__ import annotations
 

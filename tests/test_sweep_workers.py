@@ -1,4 +1,4 @@
-"""Workers of a sweep, of this machine and of a cluster: who reaches them, and how they end."""
+"""Workers of a sweep on this machine and on a cluster: access, and ends of processes."""
 
 from __future__ import annotations
 

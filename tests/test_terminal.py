@@ -1,4 +1,4 @@
-"""The terminal: one line each for odd command lines and streams, and no commands in names."""
+"""Unusual command lines and streams get one line each; names contain no terminal commands."""
 
 from __future__ import annotations
 

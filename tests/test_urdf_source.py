@@ -1,4 +1,4 @@
-"""Stock robots with no edit of their URDFs: locked joints, leaves, missing meshes, odd inertias."""
+"""Stock robots with unchanged URDFs: locked joints, last links, missing meshes, impossible inertias."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict of a run against closed forms, other optimisers, and runs that were made to fail or to do well."""
+"""The verdict of a run, against closed forms, other optimisers, and runs that fail or succeed on purpose."""
 
 from __future__ import annotations
 

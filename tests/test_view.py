@@ -1,4 +1,4 @@
-"""The replay of a bag, seen in a browser. Truth is the bag as MCAP's own reader gives it."""
+"""The replay of a bag in a browser, compared with the bag as MCAP's own reader reads it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Xacro files: expanded as xacro does, in a process that reads its own folders and does no more."""
+"""Xacro files: expanded as by xacro, in a process that can only read the file's own folders."""
 
 from __future__ import annotations
 

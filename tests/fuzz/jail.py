@@ -1,4 +1,4 @@
-"""A place for commands on untrusted files.
+"""Processes that run commands on untrusted files under limits.
 
 Each is a process with limits of time and memory, in a folder tree where it may write below one
 folder alone.

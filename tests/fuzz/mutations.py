@@ -1,4 +1,4 @@
-"""Seeded mutations of files: blind ones of bytes, and ones that know the structure of a format.
+"""Seeded mutations of files: of single bytes, and of the structure of a format.
 
 Each takes a ``random.Random`` and the bytes of a good file and gives the bytes of another. They
 use the standard library alone, and no code of the package.

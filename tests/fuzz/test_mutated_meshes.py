@@ -1,4 +1,4 @@
-"""Damaged meshes of every form: whatever is in them, they are drawn or left out with one warning.
+"""Mutated mesh files are drawn, or left out with one warning.
 
 Case i is made by ``random.Random(i)``: ten mutations of one file of the corpus, in one robot.
 """

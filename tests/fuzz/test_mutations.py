@@ -1,4 +1,4 @@
-"""Untrusted files, damaged: whatever is in them, a command ends well or with one clear line.
+"""Commands on mutated files succeed, or fail with one clear line.
 
 Case i of a kind is made by ``random.Random(i)``, so that one that fails runs again on its own: its
 seed is in its name.

@@ -310,7 +310,7 @@ def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
         return
     starts: list[str | None] = [*(variable.start or "").split()] or [None]
     if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
-        raise FmuError(f"{variable.name} has {len(starts)}start values; expected one, or one for each element")
+        raise FmuError(f"{variable.name} has {len(starts)} start values; expected one, or one for each element")
     inner = re.fullmatch(r"der\((.*)\)", variable.name)
     for i, indices in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
         index = f"[{','.join(map(str, indices))}]"

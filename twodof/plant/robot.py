@@ -103,7 +103,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     bodies = {joint.child: _mass(urdf, joint, odd) for joint in urdf.joints.values() if joint.moves}
     warnings = list(urdf.warnings)
     if empty := ", ".join(f"'{link}'" for link, mass in bodies.items() if not mass):
-        warnings.append(f"these moving links have no mass:  {empty}")
+        warnings.append(f"these moving links have no mass: {empty}")
     if odd:
         links = ", ".join(f"'{link}'" for link in dict.fromkeys(odd))
         warnings.append(
