@@ -8,12 +8,10 @@ from itertools import chain, repeat
 
 import numpy as np
 
-from ..errors import PlotError
 from ..plots.figure import Drawing, html_of
-from ..plots.interactive import Chart, scripts, stacked
+from ..plots.interactive import Chart, figures_html, stacked
 from ..plots.panels import CURVE, THIN, Panel
 from ..plots.strokes import COLOURS, GREY, HAIR, INK, LineStyle, Stroke
-from ..version import needing
 from .curves import Curve, Table
 from .prediction import WINDOW
 from .stretches import Array
@@ -51,15 +49,13 @@ def fit_page(
     Raises:
         PlotError: plotly is missing.
     """
-    with needing(PlotError, "draw a fit", "view"):
-        from plotly.offline import get_plotlyjs
     first, *others = (escape(line[:1].upper() + line[1:]) for line in lines)
     text = f'<p class="verdict"><b>{first}</b><br/>{"<br/>".join(others)}</p>\n'
     for k, (caption, rows) in enumerate(tables.items()):
         shown = " open" if k == 0 or len(rows) <= MOST_OPEN else ""
         text += f"<details{shown}><summary>{escape(caption)}</summary><table>{_html(rows)}</table></details>\n"
     content = {"figures": [*_figures(joints, curves)], "rows": [*_legend(joints)]}
-    text += f'<div id="plots"></div>\n{scripts("interactive.js", get_plotlyjs(), content)}'
+    text += f'<div id="plots"></div>\n{figures_html(content)}'
     return html_of(Drawing(title, "fit", lambda figure: None, [facts], body=lambda: text))
 
 

@@ -214,6 +214,7 @@ class Fit:
         tables["Joints: residuals, and simulated positions (rms)"] = self._joint_rows
         settings = [f"{name} = {', '.join(map(repr, values))}" for name, values in self.settings.items()]
         facts = {"bags": "\n".join(self.bags), "settings of a build": "\n".join(settings or ["none"])}
+        facts["curves"] = "long ones are drawn through the extremes of their samples"
         facts["made by"] = f"twodof {__version__}"
         return fit_page(f"Fit of {self.urdf}", lines, tables, facts, dict(zip(self.joints, self.units)), self.curves)
 

@@ -56,14 +56,20 @@ def body(tracks: Sequence[Track]) -> str:
     Raises:
         PlotError: plotly is missing.
     """
-    with needing(PlotError, "plot into a page", "view"):
-        from plotly.offline import get_plotlyjs
     over = over_time(tracks)
     content = {"figures": [over, *in_workspace(tracks)], "rows": _rows(tracks)}
-    return (
-        f'{_verdicts(tracks)}<div id="plots"></div>\n{_thinned(tracks, over)}'
-        f"{scripts('interactive.js', get_plotlyjs(), content)}"
-    )
+    return f'{_verdicts(tracks)}<div id="plots"></div>\n{_thinned(tracks, over)}{figures_html(content)}'
+
+
+def figures_html(content: object) -> str:
+    """Return the HTML that draws figures and the rows of their legend into the page's element "plots".
+
+    Raises:
+        PlotError: plotly is missing.
+    """
+    with needing(PlotError, "plot into a page", "view"):
+        from plotly.offline import get_plotlyjs
+    return scripts("interactive.js", get_plotlyjs(), content)
 
 
 def _verdicts(tracks: Sequence[Track]) -> str:
