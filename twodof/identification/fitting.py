@@ -63,10 +63,7 @@ def fit(
         BuildError: the URDF cannot be read.
         BagError: a bag cannot be read.
     """
-    if output is not None:
-        check_folder(output)
-    if gravity is not None and not np.isfinite(gravity).all():
-        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
+    _check(output, gravity)
     path = Path(urdf)
     text = read_text(path, None)
     try:
@@ -85,13 +82,7 @@ def fit(
         raise InputError("`free` names no parameter")
     fitted, held = stretches(recordings, robot)
     _check_units(parameters, fitted)
-    steps = count()
-
-    def finished() -> None:
-        if progress:
-            progress(next(steps), PASSES + 2 * len(held))
-
-    finished()
+    finished = _counter(progress, PASSES + 2 * len(held))
     try:
         found = estimate(parameters, fitted, finished)
     except ValueError as error:  # SciPy and NumPy meet an overflow
@@ -102,6 +93,26 @@ def fit(
     if output is not None:
         result.save(output)
     return result
+
+
+def _check(output: str | Path | None, gravity: Sequence[float] | None) -> None:
+    """Raise InputError if the output exists or the gravity is not finite."""
+    if output is not None:
+        check_folder(output)
+    if gravity is not None and not np.isfinite(gravity).all():
+        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
+
+
+def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callable[[], None]:
+    """Return a function that counts a finished step and reports it."""
+    steps = count()
+
+    def finished() -> None:
+        if progress:
+            progress(next(steps), total)
+
+    finished()
+    return finished
 
 
 def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
