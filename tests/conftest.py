@@ -24,6 +24,7 @@ from tools import missing, needs
 from tools import pytest_terminal_summary as pytest_terminal_summary
 
 import twodof
+from twodof.cli import printing
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -33,6 +34,7 @@ def pytest_configure(config: pytest.Config) -> None:
     A shell's background job ignores Ctrl-C, and so would all that tests start.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    printing.MOMENT = 600.0  # s: no command tells a test how slow a busy machine is
     here = str(Path(sys.executable).parent)
     if here not in os.environ["PATH"].split(os.pathsep):
         os.environ["PATH"] = os.pathsep.join([here, os.environ["PATH"]])
