@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from subprocess import PIPE
 
 import pytest
+from tools import missing
 
 import twodof
 from twodof.errors import FmuError
@@ -50,14 +51,18 @@ def waiting_run(fmu, folder):
         process.kill()
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(native_path, tmp_path, monkeypatch):
+@pytest.mark.parametrize("foreign", [False, True])
+def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(native_path, tmp_path, monkeypatch, foreign):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     others = tmp_path / "others"
     others.mkdir()
     (tmp_path / f"{TEMPORARY}link").symlink_to(others)
     (tmp_path / f"{TEMPORARY}file").touch()
-    (tmp_path / f"{TEMPORARY}foreign").mkdir()
-    os.chown(tmp_path / f"{TEMPORARY}foreign", 12345, 12345)
+    if foreign:
+        if os.geteuid():
+            missing("root")
+        (tmp_path / f"{TEMPORARY}foreign").mkdir()
+        os.chown(tmp_path / f"{TEMPORARY}foreign", 12345, 12345)
     (tmp_path / "twodof").mkdir()
     stay = set(tmp_path.iterdir())
     with waiting_run(native_path, tmp_path) as killed, waiting_run(native_path, tmp_path) as alive:
