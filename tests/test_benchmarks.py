@@ -25,7 +25,7 @@ def benchmarks() -> Iterator[SimpleNamespace]:
     """Their modules: the folder is no package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(BENCHMARKS)
-        names = ("arms", "steps", "engine", "generated", "listing", "report")
+        names = ("arms", "steps", "engine", "generated", "listing", "mpc", "report")
         yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
     for name in names:
         del sys.modules[name]
@@ -115,6 +115,17 @@ def test_the_engine_is_timed_in_c(benchmarks: SimpleNamespace, tmp_path: Path) -
     costs = [benchmarks.arms.native_cost(arm, tmp_path)()]
     costs += benchmarks.engine.derivative_costs(benchmarks.arms.shipped_arm("pose"), tmp_path, 100)
     assert all(0.0 < cost < 1e-3 for cost in costs)
+
+
+def test_a_plan_differs_from_the_fmu_by_runge_kuttas_error(benchmarks: SimpleNamespace, tmp_path: Path) -> None:
+    """A method of the fourth order: sixteen steps instead of one divide the error by 16⁴."""
+    mpc = benchmarks.mpc
+    fmu, sides = mpc.models(tmp_path)
+    plans = [mpc.solve(dae, "Gauss-Newton") for dae in sides]
+    assert {plan.status for plan in plans} == {"Solve_Succeeded"}
+    np.testing.assert_allclose(plans[1].states, plans[0].states, atol=1e-4)
+    error, fine = mpc.errors(fmu, sides[0], plans[0])
+    assert 0.5 < error / fine / 16**4 < 2.0
 
 
 def test_growth_is_the_largest_exponent(benchmarks: SimpleNamespace) -> None:
