@@ -122,7 +122,7 @@ def test_no_home_for_the_cache_is_told(monkeypatch, caplog):
 
 def test_a_cache_that_cannot_be_is_named(monkeypatch):
     monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/proc/none")
-    with pytest.raises(BuildError, match=r"'/proc/none': .*ZIG_GLOBAL_CACHE_DIR"):
+    with pytest.raises(BuildError, match=r"'/proc/none' of ZIG_GLOBAL_CACHE_DIR"):
         compile_library({"a.c": b""}, "linux64", "Arm", units=["a.c"])
 
 

@@ -408,7 +408,7 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
     [
         (["--namespace", "a b"], "--namespace 'a b' is not a valid ROS 2 name"),
         (["--state-topic", "1st"], "--state-topic '1st' is not a valid ROS 2 name"),
-        (["--command-topic", "joint_states"], "--command-topic is '/joint_states', which is publ"),
+        (["--command-topic", "joint_states"], "--command-topic '/joint_states' is a topic that"),
         (["--clock", "--state-topic", "/clock"], "'/clock' would be two topics"),
         (["--scene", "--state-topic", "tf"], "'/tf' would be two topics"),
         (["--clock", "--command-topic", "/pause"], "'/pause' would be two topics"),

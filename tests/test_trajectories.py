@@ -246,7 +246,7 @@ NAN = float("nan")
         (trajectory([(1.0, (0.1,))], ["elbow"]), "names no joint of this robot: 'elbow'"),
         (trajectory([(1.0, (0.1, 0.2))], ["joint1"] * 2), "names a joint twice: 'joint1, joint1'"),
         (trajectory([(-1.0, *THERE)], NAMES, BEGIN + SECOND // 2), "ends 1 s before it starts"),
-        (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp is 0"),
+        (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp must be 0"),
     ],
 )
 def test_what_cannot_be_followed(
