@@ -181,7 +181,7 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
         ("references.exp", b'"push.ssv"', b'"none.ssv"', "none.ssv"),
         ("references.exp", b'"push.ssv"', b'"../../../../etc/passwd"', "etc/passwd"),
         ("references.exp", b"<Experiments", b"<!DOCTYPE x><Experiments", "declares entities"),
-        ("references.exp", b'stepSize="0.01"', b'stepSize="0"', "must be a run of at most .* whole steps"),
+        ("references.exp", b'stepSize="0.01"', b'stepSize="0"', "must be a run of at most"),
         ("push-ref.csv", b"time,", b"x" * 200_000 + b",", "field larger than field limit"),
         ("references.exp", b'name="push"', b'name="move"', "two experiments have one name"),
         ("push-in.csv", b"tau_ext[1]", b"tau_axt[1]", "there is no variable 'tau_axt[1]'"),
