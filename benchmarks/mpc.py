@@ -79,7 +79,7 @@ def shooting(dae: ca.DaeBuilder, steps: int = 1) -> ca.Function:
 
 
 def solve(dae: ca.DaeBuilder, hessian: str) -> Solution:
-    """Compute the plan; the variables of an interval are its first state, and its efforts over their limits."""
+    """Return the plan; the variables of an interval are its first state, and its efforts over their limits."""
     w = ca.MX.sym("w", 21 * INTERVALS + 14)
     states = [w[21 * k : 21 * k + 14] for k in range(INTERVALS + 1)]
     efforts = [w[21 * k + 14 : 21 * k + 21] for k in range(INTERVALS)]
