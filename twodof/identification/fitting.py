@@ -13,7 +13,7 @@ from ..bag.recording import Recording
 from ..errors import InputError
 from ..export.urdf_source import end_effector, last_links, lock_joints, read_text
 from ..files import shown
-from ..plant.robot import load_robot
+from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .curves import Comparison, compare
 from .estimate import PASSES, Estimate, estimate
@@ -64,20 +64,11 @@ def fit(
         BagError: a bag cannot be read.
     """
     _check(output, gravity)
-    path = Path(urdf)
+    path, patterns = Path(urdf), [free] if isinstance(free, str) else free
     text = read_text(path, None)
-    try:
-        read = read_urdf(text)
-        locked = lock_joints(text, lock or {})
-        there = read_urdf(locked)
-        needs_frame = any("payload" in pattern for pattern in ([free] if isinstance(free, str) else free))
-        end = end_effector(there, frame) if frame or needs_frame else [*last_links(there), there.root][0]
-        robot = load_robot(locked, end, "xyz")
-    except RobotError as error:
-        raise InputError(f"{path.name}: {error}") from error
+    read, locked, robot = _robots(path.name, text, frame, lock or {}, patterns)
     recordings = _recordings(bags)
-    patterns = [free] if isinstance(free, str) else free
-    parameters = Parameters(there, robot, patterns, gravity or _recorded_gravity(recordings))
+    parameters = Parameters(locked, robot, patterns, gravity or _recorded_gravity(recordings))
     if not parameters.free:
         raise InputError("`free` names no parameter")
     fitted, held = stretches(recordings, robot)
@@ -113,6 +104,20 @@ def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callabl
 
     finished()
     return finished
+
+
+def _robots(
+    name: str, text: str, frame: str | None, lock: Mapping[str, float], patterns: Sequence[str]
+) -> tuple[Urdf, Urdf, Robot]:
+    """Return the robot of a URDF, the same with fixed joints, and the dynamics of the latter."""
+    try:
+        fixed = lock_joints(text, lock)
+        locked = read_urdf(fixed)
+        needs_frame = any("payload" in pattern for pattern in patterns)
+        end = end_effector(locked, frame) if frame or needs_frame else [*last_links(locked), locked.root][0]
+        return read_urdf(text), locked, load_robot(fixed, end, "xyz")
+    except RobotError as error:
+        raise InputError(f"{name}: {error}") from error
 
 
 def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
