@@ -173,7 +173,7 @@ def test_masses_near_zero_are_refused_in_a_line(bag, tmp_path):
     """SciPy meets an infinity in the prior of such masses."""
     light = tmp_path / "light.urdf"
     light.write_text(re.sub(r'mass value="[^"]*"', 'mass value="1e-300"', ARM.read_text("utf-8")), "utf-8")
-    with pytest.raises(InputError, match=re.escape("light.urdf: masses, efforts or speeds are too large or too small")):
+    with pytest.raises(InputError, match="masses, efforts or speeds are too large or too small"):
         twodof.fit(light, bag, "*")
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import f as f_distribution
 
+from ..errors import InputError
 from .parameters import SEEN, Parameters, Values
 from .regression import EDGES, Rows, jacobian, residual, rows_of
 from .stretches import Array, Stretch
@@ -137,7 +138,10 @@ def _solve(
 
     inside = np.maximum(z, low + 1e-9 * scales)
     options = dict(bounds=(low, np.inf), x_scale=scales, max_nfev=steps)
-    return least_squares(errors, inside, rates, xtol=TOLERANCE, ftol=TOLERANCE, gtol=TOLERANCE, **options)
+    try:
+        return least_squares(errors, inside, rates, xtol=TOLERANCE, ftol=TOLERANCE, gtol=TOLERANCE, **options)
+    except ValueError as error:  # an overflow
+        raise InputError(f"masses, efforts or speeds are too large or too small: {error}") from error
 
 
 def _information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:

@@ -74,10 +74,7 @@ def fit(
     fitted, held = stretches(recordings, robot)
     _check_units(parameters, fitted)
     finished = _counter(progress, PASSES + 2 * len(held))
-    try:
-        found = estimate(parameters, fitted, finished)
-    except ValueError as error:  # SciPy and NumPy meet an overflow
-        raise InputError(f"{path.name}: masses, efforts or speeds are too large or too small: {error}") from error
+    found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
     compared = compare(robot, models, fitted, held, finished)
     result = _result(path, text, read, parameters, found, compared, recordings)
