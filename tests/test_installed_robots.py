@@ -41,6 +41,22 @@ def test_a_panda_by_name_has_its_meshes(tmp_path: Path, monkeypatch: pytest.Monk
     assert len([name for name in fmu.members if name.endswith(".dae")]) == 10
 
 
+def test_a_panda_with_fixed_fingers_has_the_home_pose_of_its_arm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", "--robot", "panda", "--lock", "*finger*", "--no-meshes", "-o", "fixed.fmu"]) == 0
+    free, fixed = (
+        twodof.load_fmu(twodof.build_fmu(f"{i}.fmu", replace(robot, meshes=False)))
+        for i, robot in enumerate((twodof.stock_robot("panda"), twodof.stock_robot("panda", {"*finger*": 0.02})))
+    )
+    assert twodof.load_fmu("fixed.fmu").joints == fixed.joints == free.joints[:7]
+    for fmu in (twodof.load_fmu("fixed.fmu"), fixed):
+        assert [fmu.start_values[f"q_start[{i}]"] for i in range(1, 8)] == [
+            free.start_values[f"q_start[{i}]"] for i in range(1, 8)
+        ]
+
+
 def test_the_cache_of_robot_descriptions_is_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -137,11 +137,12 @@ def _build(options: argparse.Namespace) -> Path:
     from ..export.stock_robots import stock_robot
 
     platforms = PLATFORMS[options.fmi or 2] if "all" in options.platforms else options.platforms
-    stock = stock_robot(options.stock) if options.stock else FmuOptions()
+    lock = parse_locks(options.locks)
+    stock = stock_robot(options.stock, lock) if options.stock else FmuOptions(lock=lock)
     chosen = FmuOptions(
         urdf=stock.urdf or options.urdf or options.robot,
         name=options.name or "",
-        lock=parse_locks(options.locks),
+        lock=stock.lock,
         meshes=not options.no_meshes,
         gravity=options.gravity and tuple(options.gravity),
         q_start=tuple(options.q_start) if options.q_start else stock.q_start,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fnmatch
 import importlib.metadata
 import os
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,13 +39,14 @@ def stock_robots() -> dict[str, Path]:
     return dict(sorted(zip(names, found), key=lambda item: item[0].lower()))
 
 
-def stock_robot(name: str) -> FmuOptions:
+def stock_robot(name: str, lock: Mapping[str, float] | None = None) -> FmuOptions:
     """Return the options with which a robot of an installed package is built.
 
     The controlled link and the home pose come from the package's SRDF file, if it has one.
 
     Args:
         name: a name of ``stock_robots``, e.g. "panda".
+        lock: positions, rad or m, of the joints to fix, by name or shell pattern; the home pose leaves them out.
 
     Raises:
         BuildError: there is no such robot, or it cannot be read.
@@ -63,9 +66,10 @@ def stock_robot(name: str) -> FmuOptions:
     leaves = last_links(urdf)
     frames = [link for link in (*ends, *ENDS, *leaves) if link in leaves or (link in ends and link in urdf.links)]
     folder = next((parent.parent for parent in path.parents if parent.name == PACKAGE), None)
-    return FmuOptions(
-        urdf=path, mesh_dir=folder, frame=frames[0] if frames else None, q_start=_home(semantics, urdf) or None
-    )
+    fixed = {joint for pattern in lock or {} for joint in fnmatch.filter(urdf.joints, pattern)}
+    home = {joint: value for joint, value in _home(semantics, urdf).items() if joint not in fixed}
+    frame = frames[0] if frames else None
+    return FmuOptions(urdf=path, mesh_dir=folder, frame=frame, q_start=home or None, lock=lock or {})
 
 
 def _package(path: Path) -> Path:

@@ -24,6 +24,8 @@ from .prediction import WINDOW
 
 MOST_NAMES = 6
 """Largest number of parameters that the page names in its verdict."""
+MOST_COMBINATIONS = 5
+"""Largest number of combinations that the summary lists."""
 
 
 class FittedParameter(NamedTuple):
@@ -109,7 +111,10 @@ class Fit:
         """Verdict, warnings and results, one line each."""
         lines = [*self._warnings]
         if self.unseen:
-            lines.append(f"the data do not determine: {'; '.join(self.unseen)}")
+            short = sorted(self.unseen, key=len)[:MOST_COMBINATIONS]
+            more = len(self.unseen) - len(short)
+            rest = f"; and {more} more combinations, which fit.json lists" if more else ""
+            lines.append(f"the data do not determine: {'; '.join(short)}{rest}")
         for joint, unit, before, after in zip(self.joints, self.units, self.deviation_before, self.deviation):
             lines.append(
                 f"held out: in windows of {WINDOW:g} s the simulated position of joint '{joint}' differs by"
