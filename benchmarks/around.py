@@ -24,9 +24,11 @@ from arms import STEP, STEPS, compiled, shipped_arm
 from report import Figure, machine, print_figures, print_rows, spent
 
 import twodof
+from twodof.simulation.judge import BLOCK, OUTPUTS
+from twodof.simulation.master import judge_of
 from twodof.sweeps.runner import Job, Runner
 
-TURNS, SAMPLES, RUNS, SWEPT = 5, 50_000, 20, 400
+TURNS, SAMPLES, RUNS, SWEPT, BLOCKS = 5, 50_000, 20, 400, 15
 MESSAGES = 10_000_000
 TWODOF = [sys.executable, "-m", "twodof"]
 
@@ -98,6 +100,26 @@ def steps_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float], folder: Pa
     )
     ratio = median(turn[2] / turn[1] for turn in turns)
     yield Figure("the same with scene=True / without", f"{ratio:.2f}", "<= 2")
+
+
+def verdict_around(fmu: twodof.Fmu) -> Iterator[Figure]:
+    """Compare the verdict of a block of samples with the run of the block; the least of many turns of each."""
+    run = twodof.experiment(fmu, stop_time=(1 + BLOCKS) * BLOCK * STEP, step=STEP)
+    judge, steps = judge_of(run, None), twodof.samples(run)
+    row = memoryview(bytes(8 * sum(len(fmu.vector(group)) for group in OUTPUTS)))
+
+    def judged() -> None:
+        for _ in range(BLOCK):
+            judge.rows.write(row)
+        judge.flush()
+
+    def stepped() -> None:
+        for _ in range(BLOCK):
+            next(steps)
+
+    verdict, alone = (min(times) for times in zip(*((spent(judged)[0], spent(stepped)[0]) for _ in range(BLOCKS))))
+    what = f"the verdict of {BLOCK} samples / twodof.samples without a verdict"
+    yield Figure(what, f"{100 * verdict / alone:.1f} %", "<= 2 %")
 
 
 def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterator[Figure]:
@@ -184,7 +206,12 @@ def main(messages: int = MESSAGES) -> list[Figure]:
         options = twodof.FmuOptions(native=True)
         fmu = twodof.load_fmu(twodof.build_fmu(folder / "Native.fmu", options))
         in_c = floor(folder)
-        figures = [*steps_around(fmu, in_c, folder), *sweep_around(fmu, in_c), *workers_around(fmu)]
+        figures = [
+            *steps_around(fmu, in_c, folder),
+            *verdict_around(fmu),
+            *sweep_around(fmu, in_c),
+            *workers_around(fmu),
+        ]
         big_bag(fmu, folder / "big", messages)
         return [*figures, *processes(folder, messages)]
 
