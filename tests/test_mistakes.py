@@ -158,7 +158,7 @@ def test_a_mistake_gets_its_remedy(
 
 CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "a path as a sink": (lambda: twodof.run("arm.fmu", "bag2"), r"such as twodof.Bag\('my_bag'\), not 'bag2'"),  # type: ignore[arg-type]
-    "a class as a sink": (lambda: twodof.run("arm.fmu", twodof.Bag), "a sink is an object"),  # type: ignore[arg-type]
+    "a class as a sink": (lambda: twodof.run("arm.fmu", twodof.Bag), "a sink is an instance of Sink"),  # type: ignore[arg-type]
     "a text as a time": (
         lambda: twodof.run("arm.fmu", stop_time="5"),  # type: ignore[arg-type]
         "`stop_time` is '5', not a number of seconds",

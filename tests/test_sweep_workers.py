@@ -165,7 +165,7 @@ def test_an_fmu_that_workers_cannot_load_is_named(native_path: Path, tmp_path: P
 def test_workers_that_are_killed_cost_no_run(
     native_path: Path, length: Callable[[int, int], int], started: Callable[[], list[int]]
 ) -> None:
-    runs, pause, part = length(2000, 100), length(5, 0), length(1, 30)
+    runs, pause, part = length(2000, 400), length(5, 0), length(1, 30)
     most = length(1000, MOST_DEATHS - 1)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
     expected = sweep(native_path, grid=grid, stop_time=8)

@@ -48,7 +48,7 @@ def test_a_sweep_whose_name_is_no_text_is_refused(verb: str, native_path: Path, 
         arguments = [verb, name]
     done = run(*arguments, cwd=tmp_path)
     (line,) = done.stderr.splitlines()
-    assert done.returncode == 1 and "is no name in UTF-8" in line
+    assert done.returncode == 1 and "is not UTF-8 text" in line
     assert "Traceback" not in done.stdout
 
 
