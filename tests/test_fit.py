@@ -159,7 +159,7 @@ def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, 
     truth = {**TRUTH, "offset:joint2": 0.05, "gain:joint2": 1.1, "gravity[1]": 0.0, "gravity[2]": -9.81}
     for name, value in truth.items():
         assert abs(found[name].after - value) <= 3.5 * found[name].deviation, (found[name], value)
-    assert found["offset:joint2"].deviation < 5e-3 and found["gain:joint2"].deviation < 0.02
+    assert found["offset:joint2"].deviation < 6e-3 and found["gain:joint2"].deviation < 0.02
 
 
 def test_a_bag_that_is_given_twice_is_refused(bag):
