@@ -139,7 +139,8 @@ def _solve(
     inside = np.maximum(z, low + 1e-9 * scales)
     options = dict(bounds=(low, np.inf), x_scale=scales, max_nfev=steps)
     try:
-        return least_squares(errors, inside, rates, xtol=TOLERANCE, ftol=TOLERANCE, gtol=TOLERANCE, **options)
+        with np.errstate(over="ignore"):
+            return least_squares(errors, inside, rates, xtol=TOLERANCE, ftol=TOLERANCE, gtol=TOLERANCE, **options)
     except ValueError as error:  # an overflow
         raise InputError(f"masses, efforts or speeds are too large or too small: {error}") from error
 
