@@ -283,9 +283,11 @@ def cluster(folder: Path, workers: int, options: Sequence[str] = (), **environme
             time.sleep(0.05)
         yield json.loads(file.read_text())["address"], processes[0].pid
     finally:
+        children = [child for process in processes for child in children_of(process.pid)]
         for process in processes:
-            os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
             process.wait()
+        wait_until(lambda: not any(map(lives, children)))  # their trackers then remove their semaphores
 
 
 def test_a_cluster_that_asks_for_keys(native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
