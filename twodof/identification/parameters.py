@@ -31,7 +31,6 @@ from .inertials import INERTIA, dynamic_parameters, inertia_of, moving_links, se
 
 Array = NDArray[np.float64]
 OF_JOINTS = ("friction", "damping", "armature", "offset", "gain")
-OF_LINKS = ("mass", "com", "inertia")
 OF_THE_ROBOT = ("payload", "payload_com", "gravity")
 ROWS, COLUMNS = np.tril_indices(3)
 LEAST_MOMENT = 1e-3  # fraction of m·(5 cm)²: smallest initial second moments of mass of a free inertia
