@@ -230,11 +230,11 @@ def stamp_of(header: Any) -> int:
     return int(seconds) * SECOND + int(nanoseconds)
 
 
-ISOLATED = ("unshare", "--net", "sh", "-c")
+ISOLATED = ("unshare", "--net", "--mount", "sh", "-c")
 
 
 def isolated(script: str) -> tuple[str, ...]:
-    """A command's beginning that runs it in a network of its own, after a script."""
+    """A command's beginning that runs it in a network and with mounts of its own, after a script."""
     needs("networks")
     needs("ip")
     if subprocess.run([*ISOLATED, "ip link"], capture_output=True, check=False).returncode != 0:

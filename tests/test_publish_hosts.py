@@ -148,3 +148,12 @@ def test_nodes_that_command_are_recorded_and_two_at_once_reported(
     (line,) = err.splitlines()
     both = re.search("two nodes command the robot at once, (.*) and (.*): the newest wins", line)
     assert both and {both[1], both[2]} == {facts["guid"], others["guid"]}
+
+
+def test_a_host_whose_own_name_nothing_resolves() -> None:
+    """Cyclone DDS would abort the process there, as in a bare chroot without /etc/hosts."""
+    opens = "from twodof.ros.network import *; print(open_domain(Network()).interface)"
+    nameless = isolated("ip link set lo up\nmount --bind /dev/null /etc/hosts")
+    assert subprocess.run([*nameless, "getent", "hosts", "localhost"], check=False).returncode == 2
+    done = subprocess.run([*nameless, sys.executable, "-c", opens], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "lo"), done.stderr

@@ -28,7 +28,7 @@ from cyclonedds import core, domain
 LOG = logging.getLogger(__name__)
 RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
 LAST_DOMAIN = 232  # ports of larger domains would exceed 65535
-LOOPBACK = {"lo": "127.0.0.1"}
+LOOPBACK = {"lo": "127.0.0.1"}  # not localhost: Cyclone DDS aborts where no /etc/hosts resolves it
 MOST_PARTICIPANTS = 32  # participants of one host that are searched, as in rmw_cyclonedds
 NO_NETWORK = "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
 OPEN = """
@@ -134,7 +134,7 @@ class Network(NamedTuple):
             peers = "".join(f"<Peer Address={quoteattr(peer)}/>" for peer in self.peers)
             if localhost:
                 discovery += f"<SPDPInterval>{ANNOUNCED} s</SPDPInterval>"
-                for address in (own or {"": "localhost"}).values():
+                for address in (own or LOOPBACK).values():
                     peers += f'<Peer Address="{address}" PruneDelay="inf"/>'
             discovery += f"<Peers>{peers}</Peers>"
         tracing = f"<Category>config</Category><OutputFile>{trace}</OutputFile>"
@@ -266,7 +266,7 @@ def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, 
     chosen = re.findall(r"(\S+) \(index", "".join(re.findall("selected interfaces: .*", account)))
     # each line of an error begins with time, domain and program
     messages = dict.fromkeys(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
-    return opened, {name: present.get(name, "localhost") for name in chosen}, "; ".join(messages)
+    return opened, {name: present.get(name, LOOPBACK["lo"]) for name in chosen}, "; ".join(messages)
 
 
 def _aborts(number: int, configuration: str) -> bool:
