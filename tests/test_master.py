@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import threading
 import time
 import zipfile
@@ -253,6 +254,16 @@ def test_messages_of_the_fmu_go_to_logging(native_path, caplog):
     (record,) = [r for r in caplog.records if r.name == "twodof.fmu"]
     assert record.levelno == logging.WARNING
     assert "q_start[1] = 4 of joint 'joint1' is outside its limits" in record.getMessage()
+
+
+def test_a_target_in_millimetres_is_doubted_before_the_run_and_where_it_fails(native_path, caplog):
+    question = "the target x_des is 205.9 m from the end effector; is it in millimetres?"
+    with pytest.raises(SimulationError, match=re.escape(question)):  # hypot(200, 50) m, less the pose at the start
+        twodof.simulate(native_path, stop_time=0.01, settings={"x_des": (200.0, 50.0), "max_step": 1e-9})
+    assert question in caplog.text
+    caplog.clear()
+    twodof.simulate(native_path, stop_time=0.01, settings={"x_des": (40.0, 9.0)})  # too far, but perhaps in metres
+    assert not caplog.text
 
 
 def test_a_refusal_of_the_fmu_comes_with_its_own_words(native_path):

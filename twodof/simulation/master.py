@@ -8,13 +8,14 @@ The initial state is the first sample, so N steps give N + 1 samples.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from functools import partial
 from itertools import accumulate, chain, count
-from math import isfinite
+from math import dist, isfinite
 from pathlib import Path
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 LARGE = 1e5  # in a setting's unit: larger settings are probably mistakes
+FAR = 50.0  # m: a target farther from the end effector is probably in millimetres
+LOG = logging.getLogger(__name__)
 
 
 Stop = Callable[[], bool]
@@ -173,7 +176,8 @@ def _sampler(
 
 def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Resume) -> dict[str, Value]:
     """Return start values with which a run continues after a failed step; raise without them."""
-    failure = step_failure(sample.k, sample.t, error, _too_large(run, sample))
+    doubt = _too_large(run, sample) or _far_target(sample)
+    failure = step_failure(sample.k, sample.t, error, f"; {doubt}" if doubt else "")
     settings = resume(sample, failure) if error.outcome == "discarded" else None
     if settings is None:
         raise failure from error
@@ -181,12 +185,18 @@ def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Re
 
 
 def _too_large(run: Experiment, sample: Sample) -> str:
-    """Return the end of a failure's message, which names settings that are so large that they may be the cause."""
+    """Return a text that names settings that are so large that they may be the cause of a failure; "" if none are."""
     given = {**run.given, **sample.inputs}
     usual, kinds = run.fmu.start_values, run.fmu.variables
     large = [name for name, value in given.items() if abs(value) > LARGE and value != usual.get(name)]
     named = ", ".join(f"{name} = {given[name]:g} {kinds[name].unit or ''}".strip() for name in large[:3])
-    return f"; a setting may be too large: {named}" if large else ""
+    return f"a setting may be too large: {named}" if large else ""
+
+
+def _far_target(sample: Sample) -> str:
+    """Return a question about a target that no robot of usual size reaches; "" for others."""
+    away = dist(sample.x, sample.target) if sample.target else 0.0
+    return f"the target x_des is {away:.4g} m from the end effector; is it in millimetres?" if away > FAR else ""
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
@@ -301,6 +311,9 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
             source = _stepped(member.run, judge, None, lambda: ended, ready, member.resumed, member.instance)
             sources.append(stack.enter_context(closing(source)))
         latest = [next(source) for source in sources]
+        for member, first in zip(members, latest):
+            if doubt := _far_target(first):
+                LOG.warning(f"'{member.run.fmu.path}': {doubt}")
         sends, steers = [s.send for s in sources], [m.steered(pace, stop) for m in members]
         writes = [(k, sink.write) for k, member in enumerate(members) for sink in member.sinks]
         started = time.perf_counter()
