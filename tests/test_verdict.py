@@ -21,9 +21,11 @@ from twodof.geometry.kinematics import Kinematics
 from twodof.geometry.reach import nearest
 from twodof.plant.urdf import read_urdf
 from twodof.simulation import master
+from twodof.simulation.causes import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
 from twodof.simulation.setup import robot_of
+from twodof.simulation.verdict import _also
 
 STEP = 0.001
 
@@ -69,6 +71,11 @@ def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:
     a, b = (Rotation.from_quat(quat) for quat in (kept.samples[-1].quat, kept.samples[-1].target_quat))
     assert 1e-4 < (a.inv() * b).magnitude() < 1e-3
     assert verdict.outcome == "reached" and not verdict.causes
+
+
+def test_a_line_names_each_joint_once() -> None:
+    stands = [Cause("limit", f"joint '{name}' stood", joint=name) for name in ("a", "b", "a", "c", "b")]
+    assert _also((Cause("gain", "a gain"), *stands)) == ["", "also joint 'a' stood; likewise 'b', 'c'"]
 
 
 def test_a_bag_a_figure_and_a_page_say_the_same(

@@ -239,7 +239,8 @@ def _also(why: tuple[Cause, ...]) -> list[str]:
     kinds = {cause.kind: [other for other in why if other.kind == cause.kind] for cause in why}
     lines = []
     for worst, *others in kinds.values():
-        names = ", ".join(f"'{cause.joint}'" for cause in others if cause.joint)
+        joints = dict.fromkeys(cause.joint for cause in others if cause.joint not in ("", worst.joint))
+        names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
         parts = [f"also {worst.text}"] * (worst is not why[0]) + [f"likewise {names}"] * bool(names)
         lines += ["; ".join(parts), *(f"also {cause.text}" for cause in others if not cause.joint)]
     return lines
