@@ -7,14 +7,13 @@ from pathlib import Path
 
 from ..errors import InputError
 from .completion import links
+from .help import Parser
 from .info import controlled
 from .options import (
     CommandLineError,
-    add_lock,
     add_options,
     add_output,
     check_company,
-    completed,
     given_options,
     not_empty,
     output_file,
@@ -24,7 +23,7 @@ from .options import (
 from .printing import busy, print_next, print_table, quote, say
 
 
-def add(build: argparse.ArgumentParser) -> None:
+def add(build: Parser) -> None:
     """Add the options of the verb."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu; - is the standard output", output_file)
@@ -34,55 +33,36 @@ def add(build: argparse.ArgumentParser) -> None:
     option("--urdf", type=Path, metavar="U", help="another spelling of the URDF argument")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="omit the URDF's meshes from the FMU")
-    frame = option(
-        "--frame", type=not_empty, help="controlled link (EndEffector, or the last link, if there is only one)"
-    )
-    completed(frame, links)
-    add_lock(build)
+    text = "controlled link (EndEffector, or the last link, if there is only one)"
+    option("--frame", type=not_empty, help=text, completer=links)
+    add_options(build, "--lock")
     option("--axes", help="task axes, letters of xyz (xy for the shipped arm, else xyz)")
-    option(
-        "--gravity",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="gravity, m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)",
-    )
+    text = "gravity, m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)"
+    option("--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"), help=text)
     option("--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m")
-    option(
-        "--control",
-        choices=("task", "joint", "effort"),
-        default="task",
-        help="control law: target of the frame, target of each joint, or efforts (%(default)s)",
-    )
-    option(
-        "--part",
-        choices=("all", "controller"),
-        default="all",
-        help="robot under its control law, or the control law alone, as a native FMU (%(default)s)",
-    )
-    split = "build plant and controller as two native FMUs, connected in an SSP file"
-    option("--split", action="store_const", dest="part", const="split", help=split)
+    text = "control law: target of the frame, target of each joint, or efforts (%(default)s)"
+    option("--control", choices=("task", "joint", "effort"), default="task", help=text)
+    text = "robot under its control law, or the control law alone, as a native FMU (%(default)s)"
+    option("--part", choices=("all", "controller"), default="all", help=text)
+    text = "build plant and controller as two native FMUs, connected in an SSP file"
+    option("--split", action="store_const", dest="part", const="split", help=text)
     flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
     flag("--overwrite", help="replace an existing file; the default arm's FMU does not need it")
     flag("--link-environment", help="store the path of this Python's packages in the FMU")
     flag("--native", help="build the FMU as compiled C, which needs no Python")
-    option(
+    build.add_repeatable(
         "--platform",
         dest="platforms",
-        action="append",
-        default=[],
         metavar="P",
         help="platform of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
         " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
     )
     option("--fmi", type=int, choices=(2, 3), help="FMI version of a native FMU (2; 3 on Linux aarch64)")
     flag("--reference", help="add experiments with reference trajectories, for 'twodof check'")
-    flag(
-        "--scalars",
-        help="declare a variable for each element of a vector in FMI 3, for tools that do not support arrays",
-    )
+    text = "declare a variable for each element of a vector in FMI 3, for tools that do not support arrays"
+    flag("--scalars", help=text)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -2,22 +2,17 @@
 
 import argparse
 
+from .help import Parser
 from .options import add_options
 from .printing import busy, print_json, print_table, say
 
 
-def add(check: argparse.ArgumentParser) -> None:
+def add(check: Parser) -> None:
     """Add the options of the verb."""
     check.description = "Check an FMU of any vendor; exit status 1 if a row fails."
     check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0, or SSP file")
-    check.add_argument(
-        "--with",
-        dest="tools",
-        action="append",
-        default=[],
-        choices=("fmpy", "libcosim", "ecos", "fmuloader"),
-        help="run the FMU's references in this FMI tool too; repeatable",
-    )
+    tools, text = ("fmpy", "libcosim", "ecos", "fmuloader"), "run the FMU's references in this FMI tool too; repeatable"
+    check.add_repeatable("--with", dest="tools", choices=tools, help=text)
     add_options(check, "--json")
 
 

@@ -3,22 +3,17 @@
 import argparse
 from pathlib import Path
 
+from .help import Parser
 from .options import not_empty
 from .printing import print_table
 
 
-def add(export: argparse.ArgumentParser) -> None:
+def add(export: Parser) -> None:
     """Add the options of the verb."""
     export.description = "Write a bag as a table with named columns and units, or as one MCAP file of all messages."
     export.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
-    export.add_argument(
-        "-o",
-        dest="output",
-        required=True,
-        type=not_empty,
-        metavar="FILE",
-        help="output file: .csv, .parquet (extra 'sweep') or .mcap",
-    )
+    text = "output file: .csv, .parquet (extra 'sweep') or .mcap"
+    export.add_argument("-o", dest="output", required=True, type=not_empty, metavar="FILE", help=text)
 
 
 def call(options: argparse.Namespace) -> int:

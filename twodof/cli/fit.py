@@ -8,20 +8,12 @@ from pathlib import Path
 
 from ..version import install
 from .completion import links
-from .options import (
-    CommandLineError,
-    add_lock,
-    add_options,
-    add_output,
-    completed,
-    given_options,
-    not_empty,
-    parse_locks,
-)
+from .help import Parser
+from .options import CommandLineError, add_options, add_output, given_options, not_empty, parse_locks
 from .printing import plain, print_json, print_next, print_table, quote, say
 
 
-def add(fit: argparse.ArgumentParser) -> None:
+def add(fit: Parser) -> None:
     """Add the options of the verb."""
     fit.description = (
         "Fit masses, friction and other parameters of a URDF to bags with positions and efforts. Writes robot.urdf,"
@@ -30,28 +22,18 @@ def add(fit: argparse.ArgumentParser) -> None:
     option = fit.add_argument
     option("robot", type=Path, metavar="URDF", help="URDF or xacro file with the initial values")
     option("bags", nargs="+", type=not_empty, metavar="BAG", help="bags of the robot")
-    option(
+    fit.add_repeatable(
         "--free",
-        action="append",
-        default=[],
         metavar="PATTERN",
         help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
         " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
     )
     add_output(fit, "FOLDER", "folder of the fitted robot (fitted)")
-    frame = option(
-        "--frame", type=not_empty, metavar="LINK", help="link of the payload (the last link, if there is only one)"
-    )
-    completed(frame, links)
-    add_lock(fit)
-    option(
-        "--gravity",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="gravity, m/s2 in the root frame (the run's, else 0 0 -9.81)",
-    )
-    add_options(fit, "--json")
+    text = "link of the payload (the last link, if there is only one)"
+    option("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
+    text = "gravity, m/s2 in the root frame (the run's, else 0 0 -9.81)"
+    option("--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"), help=text)
+    add_options(fit, "--lock", "--json")
 
 
 def call(options: argparse.Namespace) -> int:

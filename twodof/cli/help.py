@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from ..errors import choice, nearest
+from .completion import Completer
 from .printing import plain
 
 EXAMPLES = {
@@ -93,6 +94,17 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **named: Any) -> None:
         super().__init__(allow_abbrev=False, **named)
         self._optionals.title = "options (defaults in parentheses)"
+
+    def add_argument(self, *names: str, completer: Completer | None = None, **named: Any) -> argparse.Action:
+        """Add an argument whose values the shell completes by ``completer``."""
+        action = super().add_argument(*names, **named)
+        if completer is not None:
+            action.completer = completer  # type: ignore[attr-defined]  # of argcomplete
+        return action
+
+    def add_repeatable(self, name: str, **named: Any) -> None:
+        """Add an option that collects its values in a list."""
+        self.add_argument(name, action="append", default=[], **named)
 
     def format_help(self) -> str:
         """Return the help with its examples."""

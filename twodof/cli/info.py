@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError, kind_of, neighbour, no_such
+from .help import Parser
 from .options import add_options
 from .printing import print_json, print_table, say
 from .run import verdict_rows
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 MOST_JUDGED = 200_000  # samples of a bag without a stored verdict, which takes a second to judge
 
 
-def add(info: argparse.ArgumentParser) -> None:
+def add(info: Parser) -> None:
     """Add the options of the verb."""
     info.add_argument("path", metavar="FMU|SSP|BAG|SWEEP", type=Path, help="FMU, system, bag or sweep to describe")
     add_options(info, "--robot", "--cost", "--json")

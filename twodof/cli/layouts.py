@@ -3,11 +3,12 @@
 import argparse
 
 from .fmus import chosen_fmu
+from .help import Parser
 from .options import add_fmu, add_options
 from .printing import print_next, print_table, quote
 
 
-def add(layouts: argparse.ArgumentParser) -> None:
+def add(layouts: Parser) -> None:
     """Add the options of the verb."""
     layouts.description = (
         "Write files in which RViz, PlotJuggler and Foxglove show a robot that is published, or"
@@ -15,9 +16,8 @@ def add(layouts: argparse.ArgumentParser) -> None:
     )
     add_fmu(layouts, "TwoDof.fmu, built if it is missing")
     add_options(layouts, "--frame")
-    layouts.add_argument(
-        "-o", dest="folder", default=".", metavar="FOLDER", help="folder of the layout files (%(default)s)"
-    )
+    text = "folder of the layout files (%(default)s)"
+    layouts.add_argument("-o", dest="folder", default=".", metavar="FOLDER", help=text)
     add_options(layouts, "--namespace")
     layouts.add_argument("--overwrite", action="store_true", help="replace existing files that differ")
     layouts.set_defaults(native=False)

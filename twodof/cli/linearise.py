@@ -6,25 +6,24 @@ import argparse
 from typing import TYPE_CHECKING
 
 from .completion import variables
-from .options import add_options, completed, parse_settings
+from .help import Parser
+from .options import add_options, parse_settings
 from .printing import print_json, print_table, say
 
 if TYPE_CHECKING:
     from ..linear import LinearModel
 
 
-def add(linearise: argparse.ArgumentParser) -> None:
+def add(linearise: Parser) -> None:
     """Add the options of the verb."""
     linearise.add_argument("fmu", metavar="FMU", help="native FMU")
-    point = linearise.add_argument(
+    linearise.add_repeatable(
         "--at",
-        action="append",
-        default=[],
         metavar="NAME=VALUE",
         help="operating point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
         " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
+        completer=variables(),
     )
-    completed(point, variables())
     add_options(linearise, "--json")
 
 

@@ -3,13 +3,14 @@
 import argparse
 
 from .fmus import fast_fmu
+from .help import Parser
 from .options import OF_A_PAGE, add_fmu, add_options, add_output, parse_settings
 from .printing import print_next, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 from .view import address, open_page
 
 
-def add(live: argparse.ArgumentParser) -> None:
+def add(live: Parser) -> None:
     """Add the options of the verb."""
     live.description = "Step an FMU in real time behind a page in the browser: drag the target."
     add_fmu(live, "the default arm's", "FMU")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from . import completion
+from .help import Parser
 
 if TYPE_CHECKING:
     from ..simulation.input_values import Setting
@@ -40,10 +41,11 @@ OF_A_RUN: Table = {
     "--native": dict(action="store_true", help="build and run a native FMU of the URDF or of the default arm"),
     "--set": dict(
         dest="settings",
-        action="append",
-        default=[],
         metavar="NAME=VALUE",
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
+        completer=completion.variables(),
+        action="append",
+        default=[],
     ),
     "--input": dict(
         metavar="CSV|BAG[:TOPIC]",
@@ -67,7 +69,17 @@ OF_A_PAGE: Table = {
 }
 OPTIONS: Table = {
     "--cost": dict(metavar="EXPRESSION", help="cost that ranks the runs, such as 'settling + 0.1*peak_effort'"),
-    "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)"),
+    "--frame": dict(
+        type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)", completer=completion.links
+    ),
+    "--lock": dict(
+        dest="locks",
+        metavar="JOINT[=VALUE]",
+        help="joint to fix, a name or shell pattern, and its position, rad or m (0)",
+        completer=completion.joints,
+        action="append",
+        default=[],
+    ),
     "--robot": dict(default="", metavar="NAME", help="robot's component in a system of FMUs"),
     "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's default)"),
@@ -76,54 +88,31 @@ OPTIONS: Table = {
     **OF_A_PAGE,
 }
 
-COMPLETERS = {"--set": completion.variables(), "--frame": completion.links}
-
 SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "urdf"), "--range": ("ranges",)}
 """Names of options in argparse's namespace that differ from the option."""
 
 
-def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+def add_options(parser: Parser, *names: str) -> None:
     """Add options from the table."""
     for name in names:
-        completed(parser.add_argument(name, **OPTIONS[name]), COMPLETERS.get(name))
+        parser.add_argument(name, **OPTIONS[name])
 
 
-def completed(option: argparse.Action, completer: completion.Completer | None) -> None:
-    """Let the shell complete the values of an option."""
-    if completer is not None:
-        option.completer = completer  # type: ignore[attr-defined]  # of argcomplete
-
-
-def add_fmu(parser: argparse.ArgumentParser, default: str, metavar: str = "FMU|URDF") -> None:
+def add_fmu(parser: Parser, default: str, metavar: str = "FMU|URDF") -> None:
     """Add the optional FMU or URDF to run."""
     parser.add_argument("fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}")
 
 
-def add_output(
-    parser: argparse.ArgumentParser, metavar: str, text: str, kind: Callable[[str], str] = not_empty
-) -> None:
+def add_output(parser: Parser, metavar: str, text: str, kind: Callable[[str], str] = not_empty) -> None:
     """Add the option for the output: a folder, or of kind ``output_file`` a file."""
     parser.add_argument("-o", dest="output", type=kind, metavar=metavar, help=text)
 
 
-def add_robot_options(parser: argparse.ArgumentParser) -> None:
+def add_robot_options(parser: Parser) -> None:
     """Add the options for the robot of a third-party bag."""
     parser.add_argument("--urdf", type=not_empty, metavar="U", help="URDF of the robot, for a bag without one")
-    frame = parser.add_argument("--frame", type=not_empty, metavar="LINK", help="end effector of that robot")
-    completed(frame, completion.links)
-
-
-def add_lock(parser: argparse.ArgumentParser) -> None:
-    """Add the option for locked joints."""
-    lock = parser.add_argument(
-        "--lock",
-        dest="locks",
-        action="append",
-        default=[],
-        metavar="JOINT[=VALUE]",
-        help="joint to fix, a name or shell pattern, and its position, rad or m (0)",
-    )
-    completed(lock, completion.joints)
+    text = "end effector of that robot"
+    parser.add_argument("--frame", type=not_empty, metavar="LINK", help=text, completer=completion.links)
 
 
 def given_options(options: argparse.Namespace, *names: str) -> Keywords:

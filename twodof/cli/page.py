@@ -3,11 +3,12 @@
 import argparse
 
 from .fmus import chosen_fmu, is_robot
+from .help import Parser
 from .options import add_fmu, add_options, add_output, output_file, parse_settings
 from .printing import busy, print_table
 
 
-def add(page: argparse.ArgumentParser) -> None:
+def add(page: Parser) -> None:
     """Add the options of the verb."""
     page.description = (
         "Write a native FMU as one HTML file: the robot in 3D, its plant running in the browser, a"

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .completion import joints
-from .options import CommandLineError, add_options, add_output, add_robot_options, completed, output_file
+from .help import Parser
+from .options import CommandLineError, add_options, add_output, add_robot_options, output_file
 from .printing import print_table
 from .sweep import print_best
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from ..plots.figure import Drawing
 
 
-def add(plot: argparse.ArgumentParser) -> None:
+def add(plot: Parser) -> None:
     """Add the options of the verb."""
     plot.description = (
         "Draw joint positions, velocities and efforts, the end effector's path and its error; of a"
@@ -25,8 +26,7 @@ def add(plot: argparse.ArgumentParser) -> None:
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="bags to draw; several are compared")
     text = "file: .png, .svg, .pdf or .html; - is the standard output, as PNG (a window opens)"
     add_output(plot, "FILE", text, output_file)
-    chosen = plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
-    completed(chosen, joints)
+    plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)", completer=joints)
     add_options(plot, "--cost")
     add_robot_options(plot)
 

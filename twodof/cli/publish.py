@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .help import Parser
 from .options import OF_A_RUN, CommandLineError, add_options, add_output, check_company, given_options
 from .printing import in_options, print_json, print_next, print_table, quote, say
 from .run import bag_of, experiment_of, facts_of, print_summary
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ..simulation.experiments import Experiment
 
 
-def add(publish: argparse.ArgumentParser) -> None:
+def add(publish: Parser) -> None:
     """Add the options of the verb."""
     publish.description = (
         "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
@@ -28,12 +29,8 @@ def add(publish: argparse.ArgumentParser) -> None:
         " ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and CYCLONEDDS_URI."
     )
     option, flag = publish.add_argument, partial(publish.add_argument, action="store_true")
-    option(
-        "robots",
-        nargs="*",
-        metavar="[NAME=]FMU|URDF",
-        help="default: TwoDof.fmu, built if it is missing; several are stepped together, each in a namespace",
-    )
+    text = "default: TwoDof.fmu, built if it is missing; several are stepped together, each in a namespace"
+    option("robots", nargs="*", metavar="[NAME=]FMU|URDF", help=text)
     add_output(publish, "BAG", "also record a bag, one for all robots")
     add_options(publish, "--frame")
     option("--stop-time", type=float, metavar="S", help="stop time, s (until Ctrl-C)")
@@ -44,23 +41,13 @@ def add(publish: argparse.ArgumentParser) -> None:
     flag("--foxglove-control", help="allow Foxglove to set the gains")
     add_options(publish, "--namespace")
     option("--state-topic", default="joint_states", metavar="TOPIC", help="topic of the joint states (%(default)s)")
-    option(
-        "--command-topic",
-        metavar="TOPIC",
-        help="topic of received commands (joint_commands or target_command, by the control law)",
-    )
+    text = "topic of received commands (joint_commands or target_command, by the control law)"
+    option("--command-topic", metavar="TOPIC", help=text)
     flag("--lockstep", help="wait before each step for the command with the stamp of the latest state")
-    option(
-        "--timeout",
-        type=float,
-        metavar="S",
-        help="time without a command, s, until --on-timeout applies (0.5) or a lockstep run ends (10)",
-    )
-    option(
-        "--on-timeout",
-        choices=("hold", "ramp"),
-        help="at the time-out, hold the last command, or ramp it to zero (hold targets, ramp efforts)",
-    )
+    text = "time without a command, s, until --on-timeout applies (0.5) or a lockstep run ends (10)"
+    option("--timeout", type=float, metavar="S", help=text)
+    text = "at the time-out, hold the last command, or ramp it to zero (hold targets, ramp efforts)"
+    option("--on-timeout", choices=("hold", "ramp"), help=text)
     flag("--clock", help="publish /clock, and subscribe to /pause and /step")
     option("--speed", type=float, metavar="FACTOR", help="multiple of real time (1; in lockstep unlimited)")
     add_options(publish, *OF_A_RUN)

@@ -3,10 +3,11 @@
 import argparse
 from pathlib import Path
 
+from .help import Parser
 from .printing import print_next, print_table, quote, say
 
 
-def add(recover: argparse.ArgumentParser) -> None:
+def add(recover: Parser) -> None:
     """Add the options of the verb."""
     recover.description = "Complete a bag whose writer died, so that every reader opens it."
     recover.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .fmus import chosen_fmu
+from .help import Parser
 from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_output, dated, given_options, parse_settings
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from ..simulation.run_summary import Summary
 
 
-def add(run: argparse.ArgumentParser) -> None:
+def add(run: Parser) -> None:
     """Add the options of the verb."""
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "default: rosbag2_<date and time>")
@@ -33,13 +34,8 @@ def add(run: argparse.ArgumentParser) -> None:
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run, "TwoDof.fmu, built if it is missing", "FMU|SSP|URDF")
     add_options(run, "--robot", "--frame", *OF_A_RUN)
-    run.add_argument(
-        "--fail-if",
-        action="append",
-        default=[],
-        metavar="CONDITION",
-        help="condition on the verdict that ends with exit status 3, such as 'error > 1e-3' or 'saturated > 0.1'",
-    )
+    text = "condition on the verdict that ends with exit status 3, such as 'error > 1e-3' or 'saturated > 0.1'"
+    run.add_repeatable("--fail-if", metavar="CONDITION", help=text)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 from .completion import variables
 from .fmus import fast_fmu
+from .help import Parser
 from .options import (
     CommandLineError,
     add_fmu,
     add_options,
     add_output,
     check_company,
-    completed,
     dated,
     given_options,
     parse_settings,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..simulation.expressions import Expression
 
 
-def add(sweep: argparse.ArgumentParser) -> None:
+def add(sweep: Parser) -> None:
     """Add the options of the verb."""
     sweep.description = (
         "Run an FMU over a grid or random values of any of its inputs and parameters. Without an FMU,"
@@ -41,26 +41,12 @@ def add(sweep: argparse.ArgumentParser) -> None:
     )
     option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
     add_fmu(sweep, "the default arm's", "FMU")
-    grid = option(
-        "--grid",
-        dest="grids",
-        action="append",
-        default=[],
-        metavar="NAME=LOW:HIGH:COUNT",
-        help="evenly spaced values; several variables give all combinations",
-    )
-    completed(grid, variables())
+    varied = partial(sweep.add_repeatable, completer=variables())
+    text = "evenly spaced values; several variables give all combinations"
+    varied("--grid", dest="grids", metavar="NAME=LOW:HIGH:COUNT", help=text)
     option("--random", type=int, metavar="N", help="number of random draws from the --range options")
     option("--seed", type=int, metavar="S", help="seed of the random draws (0)")
-    drawn = option(
-        "--range",
-        dest="ranges",
-        action="append",
-        default=[],
-        metavar="NAME=LOW:HIGH",
-        help="range of uniformly drawn values",
-    )
-    completed(drawn, variables())
+    varied("--range", dest="ranges", metavar="NAME=LOW:HIGH", help="range of uniformly drawn values")
     add_options(sweep, "--stop-time", "--step", "--set")
     add_output(sweep, "OUT", "default: sweep_<date and time>")
     flag("--resume", help="continue the sweep in OUT without repeating finished runs")

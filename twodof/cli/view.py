@@ -5,21 +5,18 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from .help import Parser
 from .options import OF_A_PAGE, Keywords, add_options, add_robot_options, check_company, given_options, output_file
 from .printing import in_options, say
 from .signals import asked_to_stop
 
 
-def add(view: argparse.ArgumentParser) -> None:
+def add(view: Parser) -> None:
     """Add the options of the verb."""
     view.description = "Replay a bag in the browser, or write a page or a film that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
-    view.add_argument(
-        "--export",
-        type=output_file,
-        metavar="FILE",
-        help="write a page (.html), a film (.mp4, .webp, .gif) or a picture (.png) instead; - is the standard output",
-    )
+    text = "write a page (.html), a film (.mp4, .webp, .gif) or a picture (.png) instead; - is the standard output"
+    view.add_argument("--export", type=output_file, metavar="FILE", help=text)
     add_robot_options(view)
     view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of the packages or meshes of the URDF")
     view.add_argument("--fmu", metavar="FMU", help="FMU that contains the robot's meshes")
