@@ -1,7 +1,5 @@
 """The rooms of the package: imports, third-party libraries, and limits of length."""
 
-from __future__ import annotations
-
 import ast
 import re
 from graphlib import TopologicalSorter
@@ -90,7 +88,7 @@ def room(path: Path) -> str:
     return parts[1] if parts[0] == "twodof" else parts[0]
 
 
-def test_a_room_imports_those_before_it_alone() -> None:
+def test_a_room_imports_those_before_it_alone():
     order = list(ROOMS)
     inside = {path for path in PYTHON if path.parts[0] == "twodof"}
     assert {room(path) for path in inside} == {*order, "__init__", "__main__"}
@@ -100,7 +98,7 @@ def test_a_room_imports_those_before_it_alone() -> None:
             assert own <= {*order[: order.index(room(path)) + 1]}, path
 
 
-def test_rooms_import_few_others() -> None:
+def test_rooms_import_few_others():
     arrows = {
         (room(path), other)
         for path in PYTHON
@@ -110,7 +108,7 @@ def test_rooms_import_few_others() -> None:
     assert len(arrows) <= MOST_ARROWS
 
 
-def test_modules_import_each_other_in_no_circle() -> None:
+def test_modules_import_each_other_in_no_circle():
     modules = {".".join(path.with_suffix("").parts): path for path in PYTHON}
     graph = {}
     for module, path in modules.items():
@@ -119,7 +117,7 @@ def test_modules_import_each_other_in_no_circle() -> None:
     assert [*TopologicalSorter(graph).static_order()]  # which raises CycleError
 
 
-def test_a_foreign_library_is_in_its_room_alone() -> None:
+def test_a_foreign_library_is_in_its_room_alone():
     rooms: dict[str, set[str]] = {library: set() for library in LIBRARIES}
     for path in PYTHON:
         for library in {name.partition(".")[0] for name in imported(path)} & LIBRARIES.keys():
@@ -127,7 +125,7 @@ def test_a_foreign_library_is_in_its_room_alone() -> None:
     assert rooms == LIBRARIES
 
 
-def test_nothing_is_longer_than_can_be_read() -> None:
+def test_nothing_is_longer_than_can_be_read():
     sources = [p for kind in ("*.[ch]", "*.js") for p in (ROOT / "fmu_src").rglob(kind)]
     sources += (ROOT / "twodof").rglob("*.js")
     files = [*PYTHON, *(path.relative_to(ROOT) for path in sources)]
@@ -141,12 +139,12 @@ def test_nothing_is_longer_than_can_be_read() -> None:
     assert not long
 
 
-def test_the_package_has_few_files_beside_its_rooms() -> None:
+def test_the_package_has_few_files_beside_its_rooms():
     files = {path.name for path in (ROOT / "twodof").glob("*.py")}
     assert len(files) <= MOST_FILES
 
 
-def test_no_two_files_of_the_package_have_one_name() -> None:
+def test_no_two_files_of_the_package_have_one_name():
     names = [path.name for path in PYTHON if path.parts[0] == "twodof" and path.name != "__init__.py"]
     assert len(names) == len({*names}), sorted(name for name in names if names.count(name) > 1)
 
@@ -183,7 +181,7 @@ def fragments(tree: ast.AST) -> list[str]:
     return found
 
 
-def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase() -> None:
+def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase():
     texts = [(ROOT / folder).rglob("*.py") for folder in ("docs", "benchmarks")]
     scripts = {path.relative_to(ROOT): ast.parse(path.read_text("utf-8")) for paths in texts for path in paths}
     found = [f"{path}: {line}" for path, tree in (PYTHON | scripts).items() for line in fragments(tree)]
@@ -193,7 +191,7 @@ def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase() -> None:
     assert not found, "\n".join(found)
 
 
-def test_a_message_of_the_library_names_arguments() -> None:
+def test_a_message_of_the_library_names_arguments():
     """The command line translates them; a page of a sweep shows a command to type, a plugin of pytest has options."""
     option = re.compile(r"(?<!pip install)(?:^|[\s'`(])--[a-z]")
     library = (path for path in PYTHON if "cli" not in path.parts and path.name not in ("maps.py", "plugin.py"))
@@ -206,7 +204,7 @@ def test_a_message_of_the_library_names_arguments() -> None:
     assert not found, "\n".join(found)
 
 
-def test_one_function_prints() -> None:
+def test_one_function_prints():
     """The one that escapes control and bidirectional characters."""
     calls = {
         str(path)

@@ -4,12 +4,10 @@ Readers are rosbags', the MCAP project's own and the standard library's sqlite3;
 path is a closed form; type hashes are those that ROS 2 publishes.
 """
 
-from __future__ import annotations
-
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -22,7 +20,6 @@ from bags import (
     START,
     STORAGES,
     STORE,
-    JointState,
     both_storages,
     foreign_readers,
     header,
@@ -70,7 +67,7 @@ KINDS: dict[str, dict[str, Any]] = {"plain": {}, "effort": {"effort": True}, "sc
 
 
 @pytest.fixture(scope="module")
-def recording(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def recording(native_path, tmp_path_factory):
     """The default run, written to all kinds of bags at once."""
     run = twodof.experiment(native_path, stamp_start=START)
     recording = Recording(run, Collector(), tmp_path_factory.mktemp("bags"))
@@ -84,7 +81,7 @@ def recording(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Re
 
 
 @pytest.fixture(scope="module")
-def run(native_path: Path) -> Experiment:
+def run(native_path):
     return twodof.experiment(native_path)
 
 
@@ -93,9 +90,7 @@ def run(native_path: Path) -> Experiment:
 
 @foreign_readers
 @pytest.mark.parametrize("kind", ["plain", "effort"])
-def test_bag_has_every_sample_bit_for_bit(
-    recording: Recording, storage: str, read: Callable[[Path], list[JointState]], kind: str
-) -> None:
+def test_bag_has_every_sample_bit_for_bit(recording, storage, read, kind):
     """With the effort of the samples where it is asked for."""
     effort = kind == "effort"
     expected = [joint_state(k, s, effort=effort) for k, s in enumerate(recording.samples)]
@@ -110,9 +105,7 @@ class Pause(twodof.Sink):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_the_bytes_that_are_reproducible_are_those_of_the_docs(
-    storage: str, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bytes_that_are_reproducible_are_those_of_the_docs(storage, native_path, tmp_path, monkeypatch):
     """A run that is flushed more often has another storage file, and all else alike."""
     bags = []
     for name, period in (("seldom", 60.0), ("often", 0.01)):
@@ -132,7 +125,7 @@ def test_the_bytes_that_are_reproducible_are_those_of_the_docs(
     assert differing == {"bag.mcap" if storage == "mcap" else "bag.db3"}
 
 
-def test_first_stamp_is_the_wall_clock_by_default(native_path: Path, tmp_path: Path) -> None:
+def test_first_stamp_is_the_wall_clock_by_default(native_path, tmp_path):
     before = time.time_ns()
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.01)
     first, second = (state.stamp for state in read_with_rosbags(tmp_path / "bag"))
@@ -140,23 +133,21 @@ def test_first_stamp_is_the_wall_clock_by_default(native_path: Path, tmp_path: P
     assert second - first == PERIOD
 
 
-def test_start_of_the_stamps_is_exact(native_path: Path, tmp_path: Path) -> None:
+def test_start_of_the_stamps_is_exact(native_path, tmp_path):
     bag = twodof.Bag(tmp_path / "bag")
     twodof.simulate(native_path, bag, stop_time=0.01, stamp_start=START + 0.25)
     assert read_with_rosbags(tmp_path / "bag")[0].stamp == START * SECOND + SECOND // 4
 
 
 @pytest.mark.parametrize("start", [-1.0, 2.0**31 - 3, float("nan"), float("inf")])
-def test_stamp_out_of_the_range_of_ros_is_refused(native_path: Path, start: float) -> None:
+def test_stamp_out_of_the_range_of_ros_is_refused(native_path, start):
     """The last sample's too."""
     with pytest.raises(InputError, match="stamp"):
         twodof.experiment(native_path, stop_time=5.0, stamp_start=start)
 
 
 @pytest.mark.parametrize("now", [-1, (2**31) * SECOND])
-def test_wall_clock_out_of_the_range_of_ros_is_refused(
-    native_path: Path, now: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wall_clock_out_of_the_range_of_ros_is_refused(native_path, now, monkeypatch):
     monkeypatch.setattr(time, "time_ns", lambda: now)
     with pytest.raises(InputError, match="from the wall clock on are not those of 1970 to 2038"):
         twodof.experiment(native_path)
@@ -166,7 +157,7 @@ def test_wall_clock_out_of_the_range_of_ros_is_refused(
 
 
 @both_storages
-def test_metadata_describes_the_bag(recording: Recording, storage: str) -> None:
+def test_metadata_describes_the_bag(recording, storage):
     found = metadata(recording.bag(storage))
     file = f"{storage}_plain.{'mcap' if storage == 'mcap' else 'db3'}"
     whole = {
@@ -189,7 +180,7 @@ def test_metadata_describes_the_bag(recording: Recording, storage: str) -> None:
 
 
 @both_storages
-def test_topics_have_the_type_hashes_that_ros_publishes(recording: Recording, storage: str) -> None:
+def test_topics_have_the_type_hashes_that_ros_publishes(recording, storage):
     bag = recording.bag(storage, "scene")
     topics = [topic["topic_metadata"] for topic in metadata(bag)["topics_with_message_count"]]
     assert {topic["type"] for topic in topics} == set(TYPE_HASHES)
@@ -203,7 +194,7 @@ def test_topics_have_the_type_hashes_that_ros_publishes(recording: Recording, st
 
 
 @both_storages
-def test_topics_have_the_quality_of_service_that_subscribers_expect(recording: Recording, storage: str) -> None:
+def test_topics_have_the_quality_of_service_that_subscribers_expect(recording, storage):
     # numbers of rmw/types.h: keep last 1, reliable 1, transient local 1, volatile 2
     expected = {
         "/joint_states": {"history": 1, "depth": 10, "reliability": 1, "durability": 2},
@@ -237,7 +228,7 @@ def test_topics_have_the_quality_of_service_that_subscribers_expect(recording: R
     assert stored == texts
 
 
-def test_mcap_has_the_profile_and_the_index_that_rosbag2_expects(recording: Recording) -> None:
+def test_mcap_has_the_profile_and_the_index_that_rosbag2_expects(recording):
     with (recording.bag("mcap") / "mcap_plain.mcap").open("rb") as file:
         reader = make_reader(file)
         assert reader.get_header().profile == "ros2"
@@ -256,7 +247,7 @@ def test_mcap_has_the_profile_and_the_index_that_rosbag2_expects(recording: Reco
     assert embedded == metadata(recording.bag("mcap"))
 
 
-def test_sqlite3_has_the_tables_that_rosbag2_expects(recording: Recording) -> None:
+def test_sqlite3_has_the_tables_that_rosbag2_expects(recording):
     # schema 4 of rosbag2_storage_sqlite3
     columns = {
         "schema": ["schema_version", "ros_distro"],
@@ -281,7 +272,7 @@ def test_sqlite3_has_the_tables_that_rosbag2_expects(recording: Recording) -> No
 
 
 @both_storages
-def test_read_bag_gives_back_what_was_written(recording: Recording, storage: str) -> None:
+def test_read_bag_gives_back_what_was_written(recording, storage):
     found = twodof.read_bag(recording.bag(storage, "effort"))
     assert found.joints == ("joint1", "joint2")
     np.testing.assert_array_equal(found.stamps, START * SECOND + PERIOD * np.arange(501))
@@ -296,7 +287,7 @@ def test_read_bag_gives_back_what_was_written(recording: Recording, storage: str
     ]
 
 
-def test_read_bag_gives_no_effort_where_there_is_none(recording: Recording) -> None:
+def test_read_bag_gives_no_effort_where_there_is_none(recording):
     assert twodof.read_bag(recording.bag("mcap")).tau.shape == (501, 0)
 
 
@@ -309,7 +300,7 @@ def write_states(path: Path, states: Sequence[tuple[Sequence[str], Sequence[floa
     return write_third_party(path, [("/chatter", 1, hello), *given], storage_plugin=StoragePlugin.SQLITE3)
 
 
-def test_third_party_bag_is_read_without_provenance(tmp_path: Path) -> None:
+def test_third_party_bag_is_read_without_provenance(tmp_path):
     states = [(["a", "b", "c"], [k, k + 0.1, k + 0.2]) for k in range(4)]
     found = twodof.read_bag(write_states(tmp_path / "bag", states))
     assert found.provenance == {}
@@ -320,14 +311,14 @@ def test_third_party_bag_is_read_without_provenance(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("other", [["a", "b", "c"], ["b", "a"], ["c", "d"]])
-def test_bag_whose_joint_states_name_different_joints_is_refused(tmp_path: Path, other: list[str]) -> None:
+def test_bag_whose_joint_states_name_different_joints_is_refused(tmp_path, other):
     states = [(["a", "b"], [0.0, 1.0]), (other, [2.0] * len(other))]
     with pytest.raises(BagError, match="joint states of different joints"):
         twodof.read_bag(write_states(tmp_path / "bag", states))
 
 
 @pytest.mark.parametrize(("frames", "known"), [("aaa", "a"), (["a", "a", "bb"], ""), (["a", "a", "b" * 9], "")])
-def test_targets_are_known_where_they_are_in_one_frame(tmp_path: Path, frames: Sequence[str], known: str) -> None:
+def test_targets_are_known_where_they_are_in_one_frame(tmp_path, frames, known):
     point = STORE.types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0)
     targets = [STORE.types["geometry_msgs/msg/PointStamped"](header(0, f), point) for f in frames]
     states = [joint_message(0, "j", [0.0], [0.0]) for _ in frames]
@@ -356,7 +347,7 @@ def joint_states_of_another_writer(rng: np.random.Generator) -> Iterator[tuple[i
         yield k * SECOND, bytes(data)
 
 
-def test_joint_states_are_read_as_rosbags_reads_them_in_whatever_form(tmp_path: Path) -> None:
+def test_joint_states_are_read_as_rosbags_reads_them_in_whatever_form(tmp_path):
     kind = "sensor_msgs/msg/JointState"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/joint_states", kind, typestore=STORE)
@@ -375,13 +366,13 @@ def test_joint_states_are_read_as_rosbags_reads_them_in_whatever_form(tmp_path: 
     np.testing.assert_array_equal(ends.v, found.v[[0, -1]])
 
 
-def test_bag_without_joint_states_is_refused(tmp_path: Path) -> None:
+def test_bag_without_joint_states_is_refused(tmp_path):
     with pytest.raises(BagError, match="has no joint states"):
         twodof.read_bag(write_states(tmp_path / "bag", []))
 
 
 @pytest.mark.parametrize("content", [None, "folder", "file", "nonsense"])
-def test_what_is_no_bag_is_refused(tmp_path: Path, content: str | None) -> None:
+def test_what_is_no_bag_is_refused(tmp_path, content):
     path = tmp_path / "bag"
     if content == "file":
         path.write_text("hello")
@@ -393,7 +384,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, content: str | None) -> None:
         twodof.read_bag(path)
 
 
-def test_definitions_are_those_of_humble() -> None:
+def test_definitions_are_those_of_humble():
     from twodof.ros.messages import DEFINITIONS, store_of
 
     for name in reversed(DEFINITIONS):  # what is made of others first
@@ -403,7 +394,7 @@ def test_definitions_are_those_of_humble() -> None:
         assert ours.generate_msgdef(name) == STORE.generate_msgdef(name)
 
 
-def test_a_chunk_and_its_index_are_those_of_rosbags(tmp_path: Path) -> None:
+def test_a_chunk_and_its_index_are_those_of_rosbags(tmp_path):
     written = []
     for kind in (McapWriter, McapStorage):
         folder = tmp_path / kind.__name__ / "bag"

@@ -1,10 +1,7 @@
 """Commands of bags replayed into an FMU; rosbags writes the third-party bags."""
 
-from __future__ import annotations
-
 import html
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,13 +26,13 @@ def point(stamp: int, x: float, y: float) -> Any:
 
 
 @pytest.fixture(scope="module")
-def effort(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def effort(tmp_path_factory):
     """The bare default arm."""
     path = tmp_path_factory.mktemp("effort") / "Bare.fmu"
     return twodof.build_fmu(path, twodof.FmuOptions(control="effort", native=True))
 
 
-def test_a_recorded_run_is_replayed_bit_for_bit(native_path: Path, tmp_path: Path) -> None:
+def test_a_recorded_run_is_replayed_bit_for_bit(native_path, tmp_path):
     targets = {0: (0.1, 0.2), 70: (0.22, 0.05), 71: (0.2, 0.0), 150: (0.0, 0.25)}
     run = twodof.experiment(native_path, stop_time=2, step=0.01, settings={"Kp": 80})
     source = twodof.samples(run)
@@ -56,9 +53,7 @@ def test_a_recorded_run_is_replayed_bit_for_bit(native_path: Path, tmp_path: Pat
     assert changes[0] == changes[1] and len(changes[0]) == 4
 
 
-def test_a_run_without_changes_is_replayed_from_its_start(
-    native_path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_without_changes_is_replayed_from_its_start(native_path, tmp_path, capfd):
     settings = {"x_des": (0.1, 0.2), "Kp": 80.0}
     twodof.simulate(native_path, twodof.Bag(tmp_path / "first"), stop_time=1, settings=settings)
     command = ["run", str(native_path), "--input", str(tmp_path / "first"), "--stop-time", "1"]
@@ -72,9 +67,7 @@ def test_a_run_without_changes_is_replayed_from_its_start(
     assert other.provenance["start_values"]["Kp[1]"] == 80.0
 
 
-def test_a_run_of_another_control_is_not_replayed(
-    native_path: Path, effort: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_another_control_is_not_replayed(native_path, effort, tmp_path, capfd):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "first"), stop_time=0.1)
     command = ["run", str(effort), "--input", str(tmp_path / "first"), "-o", str(tmp_path / "a")]
     assert main(command) == 1
@@ -83,7 +76,7 @@ def test_a_run_of_another_control_is_not_replayed(
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
-def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: StoragePlugin) -> None:
+def test_commands_of_another_writer(effort, tmp_path, storage):
     """Held from the first communication point at or after each, as a run on the network has it."""
     given = {0: (1.0, 0.5), 3: (-2.0, 0.25), 40: (0.5, -0.5)}
     states = [
@@ -106,7 +99,7 @@ def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: Stora
     assert twodof.read_commands(effort, bag) == twodof.read_commands(effort, bag, "/cmd")
 
 
-def test_points(native_path: Path, tmp_path: Path) -> None:
+def test_points(native_path, tmp_path):
     goals = [(BEGIN, point(0, 0.1, 0.2)), (BEGIN + STEP, point(0, 0.2, 0.1))]
     bag = write_third_party(tmp_path / "bag", [("/goal", *goal) for goal in goals])
     assert twodof.read_commands(native_path, bag) == [
@@ -134,14 +127,7 @@ def test_points(native_path: Path, tmp_path: Path) -> None:
         ([("/a", BEGIN, joint_message(0, ["elbow"], (), (), (1.0,)))], None, "names no joint of this"),
     ],
 )
-def test_what_cannot_be_replayed(
-    effort: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    messages: list[tuple[str, int, Any]],
-    topic: str | None,
-    reason: str,
-) -> None:
+def test_what_cannot_be_replayed(effort, tmp_path, capfd, messages, topic, reason):
     bag = write_third_party(tmp_path / "bag", messages)
     given = f"{bag}:{topic}" if topic else str(bag)
     assert main(["run", str(effort), "--input", given, "-o", str(tmp_path / "none")]) == 1
@@ -152,9 +138,7 @@ def test_what_cannot_be_replayed(
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("last", [np.nan, np.inf])
-def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], last: float
-) -> None:
+def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(tmp_path, capfd, last):
     """Nor does NumPy say anything of it."""
 
     def bag(name: str, last: float) -> str:
@@ -174,7 +158,7 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
     assert said in capfd.readouterr().out
 
 
-def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path, capfd):
     """Sampled at other times, and one of them for longer."""
 
     def bag(name: str, count: int, step: int, off: float) -> str:

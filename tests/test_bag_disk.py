@@ -1,13 +1,10 @@
 """Bags and the disk: read-only folders, foreign locks, and the order in which --fsync writes."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil
 import sqlite3
 import subprocess
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -17,9 +14,7 @@ import twodof
 from twodof.errors import BagError
 
 
-def test_an_unfinished_database_in_a_read_only_folder_is_read(
-    native_path: Path, tmp_path: Path, disk: Callable[..., Path]
-) -> None:
+def test_an_unfinished_database_in_a_read_only_folder_is_read(native_path, tmp_path, disk):
     """With the log that its writer has left beside it."""
     bag, place = tmp_path / "bag", disk(8192)
     twodof.simulate(native_path, twodof.Bag(bag, storage="sqlite3"), stop_time=0.1)
@@ -33,9 +28,7 @@ def test_an_unfinished_database_in_a_read_only_folder_is_read(
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_messages_are_on_the_disk_before_metadata_says_that_they_are(
-    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: str
-) -> None:
+def test_messages_are_on_the_disk_before_metadata_says_that_they_are(native_path, tmp_path, monkeypatch, storage):
     told: list[tuple[str, int]] = []
     fsync, replace = os.fsync, Path.replace
 
@@ -56,9 +49,7 @@ def test_messages_are_on_the_disk_before_metadata_says_that_they_are(
     assert whole < told.index((str(bag / "metadata.yaml"), 0))
 
 
-def test_a_foreign_lock_is_not_waited_for_without_end(
-    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_foreign_lock_is_not_waited_for_without_end(native_path, tmp_path, monkeypatch):
     """A program that locks each folder that appears."""
     monkeypatch.setattr("twodof.files.LOCK_TIMEOUT", 0.1)
     mkdir, held = Path.mkdir, []

@@ -1,7 +1,5 @@
 """Links in an untrusted bag, by which it could read or copy any file of this machine."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -18,7 +16,7 @@ SECRET = "a word that must not get out"
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
-def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> Path:
+def bag(request, tmp_path_factory, native_path):
     folder = tmp_path_factory.mktemp("links")
     sink = twodof.Bag(folder / "bag", storage=request.param)
     twodof.simulate(native_path, sink, stop_time=0.1)
@@ -26,7 +24,7 @@ def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture
-def linked(bag: Path, tmp_path: Path) -> Path:
+def linked(bag, tmp_path):
     """A copy whose writer died, beside a folder of private files."""
     copy = tmp_path / "bag"
     shutil.copytree(bag, copy)
@@ -44,7 +42,7 @@ def move_out(file: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["link", "chain", "name"])
-def test_a_linked_provenance_is_not_copied(kind: str, linked: Path) -> None:
+def test_a_linked_provenance_is_not_copied(kind, linked):
     """Its messages are saved without it."""
     target = move_out(linked / "run.json")
     content = json.loads(target.read_text())
@@ -63,7 +61,7 @@ def test_a_linked_provenance_is_not_copied(kind: str, linked: Path) -> None:
     assert twodof.read_bag(linked).q.shape == (11, 2)
 
 
-def test_linked_messages_are_refused(linked: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_linked_messages_are_refused(linked, capsys):
     (file,) = (path for path in linked.iterdir() if path.suffix in (".mcap", ".db3"))
     target = move_out(file)
     before = target.read_bytes()
@@ -78,7 +76,7 @@ def test_linked_messages_are_refused(linked: Path, capsys: pytest.CaptureFixture
     assert sorted(path.name for path in linked.parent.iterdir()) == ["bag", "private"]
 
 
-def test_a_pipe_in_the_place_of_messages_is_refused(linked: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pipe_in_the_place_of_messages_is_refused(linked, capsys):
     (file,) = (path for path in linked.iterdir() if path.suffix in (".mcap", ".db3"))
     file.unlink()
     os.mkfifo(file)
@@ -88,7 +86,7 @@ def test_a_pipe_in_the_place_of_messages_is_refused(linked: Path, capsys: pytest
         assert line == f"twodof: error: '{file}' is no regular file; remove it from the bag"
 
 
-def test_a_bag_that_the_user_names_by_a_link_is_read(linked: Path) -> None:
+def test_a_bag_that_the_user_names_by_a_link_is_read(linked):
     twodof.recover(linked)
     (linked.parent / "name").symlink_to(linked)
     assert twodof.read_bag(linked.parent / "name").q.shape == (11, 2)
@@ -97,7 +95,7 @@ def test_a_bag_that_the_user_names_by_a_link_is_read(linked: Path) -> None:
         assert twodof.read_bag(linked.parent / "single.mcap").q.shape == (11, 2)
 
 
-def test_linked_metadata_is_not_read(linked: Path) -> None:
+def test_linked_metadata_is_not_read(linked):
     """It says how many messages there are, by which a whole bag is known."""
     text = "rosbag2_bagfile_information:\n  message_count: 11\n"
     (linked.parent / "private/x").write_text(text)
@@ -107,7 +105,7 @@ def test_linked_metadata_is_not_read(linked: Path) -> None:
     assert not (linked / "metadata.yaml").is_symlink()
 
 
-def test_meshes_without_end_are_not_copied(linked: Path) -> None:
+def test_meshes_without_end_are_not_copied(linked):
     """A file of zeros takes no room on the disk, until it is copied."""
     (linked / "meshes").mkdir()
     with (linked / "meshes/x.stl").open("wb") as file:
@@ -119,7 +117,7 @@ def test_meshes_without_end_are_not_copied(linked: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["%2E", "%2E%2E", "%2F", "a%2F%2E%2E"])
-def test_names_of_robots_are_no_paths(name: str, linked: Path) -> None:
+def test_names_of_robots_are_no_paths(name, linked):
     (linked / "run.json").rename(linked / f"run.{name}.json")
     assert twodof.recover(linked).counts == {"/joint_states": 11}
     assert [path.name for path in linked.iterdir() if path.suffix == ".json"] == []

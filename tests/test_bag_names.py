@@ -1,7 +1,5 @@
 """Bags whose names are not plain text: read, or refused before they are written."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -12,11 +10,10 @@ from bags import assert_consistent, content, sample, unfinished
 
 import twodof
 from twodof.errors import BagError
-from twodof.simulation.experiments import Experiment
 
 
 @pytest.fixture(scope="module")
-def run(native_path: Path) -> Experiment:
+def run(native_path):
     return twodof.experiment(native_path)
 
 
@@ -35,9 +32,7 @@ def renamed(bag: Path, name: bytes) -> Path:
     ("storage", "name"),
     [("mcap", b"\xff"), ("mcap", b"a?b"), *[("sqlite3", name) for name in (b"\xff", b"a?b", b"a%41")]],
 )
-def test_bag_of_a_name_that_none_would_find_again_is_refused(
-    run: Experiment, tmp_path: Path, storage: str, name: bytes
-) -> None:
+def test_bag_of_a_name_that_none_would_find_again_is_refused(run, tmp_path, storage, name):
     bag = renamed(unfinished(tmp_path, run, storage, 10), name)
     before = content(tmp_path)
     if storage == "mcap" and name != b"\xff":
@@ -52,7 +47,7 @@ def test_bag_of_a_name_that_none_would_find_again_is_refused(
 
 
 @pytest.mark.parametrize("verb", ["info", "plot"])
-def test_bag_of_a_name_that_is_not_utf8_is_read(run: Experiment, tmp_path: Path, verb: str) -> None:
+def test_bag_of_a_name_that_is_not_utf8_is_read(run, tmp_path, verb):
     """As on a terminal that knows UTF-8 alone."""
     with twodof.Bag(tmp_path / "bag").begin(run) as sink:
         for k in range(3):

@@ -1,14 +1,12 @@
 """A bag while it is written: location, early ends, memory and disk."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from threading import Timer
@@ -42,14 +40,14 @@ MIB = 1024**2
 
 
 @pytest.fixture(scope="module")
-def run(native_path: Path) -> Experiment:
+def run(native_path):
     return twodof.experiment(native_path)
 
 
 # --- where it may be written ---
 
 
-def test_existing_bag_is_kept_unless_told_otherwise(run: Experiment, tmp_path: Path) -> None:
+def test_existing_bag_is_kept_unless_told_otherwise(run, tmp_path):
     path = tmp_path / "bag"
     with twodof.Bag(path).begin(run) as bag:
         bag.write(sample(run, 0))
@@ -63,9 +61,7 @@ def test_existing_bag_is_kept_unless_told_otherwise(run: Experiment, tmp_path: P
 
 
 @pytest.mark.parametrize("moment", ["remove", "open", "add_connection"])
-def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(
-    run: Experiment, tmp_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(run, tmp_path, moment, monkeypatch):
     """The second comes just before the first removes the old bag, opens its own, adds a topic."""
     path = tmp_path / "bag"
     with twodof.Bag(path).begin(run):
@@ -92,9 +88,7 @@ def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(
     assert assert_consistent(path, "mcap") == 3
 
 
-def test_bag_is_locked_though_another_looks_whether_it_is(
-    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bag_is_locked_though_another_looks_whether_it_is(run, tmp_path, monkeypatch):
     opened = BagWriter.open
 
     def looked_at(writer: BagWriter) -> None:
@@ -118,7 +112,7 @@ def test_bag_is_locked_though_another_looks_whether_it_is(
     ],
     ids=["empty", "other files", "another run.json", "another metadata.yaml"],
 )
-def test_what_is_no_bag_is_never_overwritten(tmp_path: Path, files: dict[str, str]) -> None:
+def test_what_is_no_bag_is_never_overwritten(tmp_path, files):
     """A folder, or a file."""
     path = tmp_path / "folder"
     path.mkdir()
@@ -131,7 +125,7 @@ def test_what_is_no_bag_is_never_overwritten(tmp_path: Path, files: dict[str, st
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_folder_that_appears_before_the_first_sample_is_kept(run: Experiment, tmp_path: Path, overwrite: bool) -> None:
+def test_folder_that_appears_before_the_first_sample_is_kept(run, tmp_path, overwrite):
     path = tmp_path / "bag"
     bag = twodof.Bag(path, overwrite=overwrite).begin(run)
     path.mkdir()
@@ -142,7 +136,7 @@ def test_folder_that_appears_before_the_first_sample_is_kept(run: Experiment, tm
 
 
 @both_storages
-def test_a_link_stays_and_the_bag_behind_it_is_written(run: Experiment, tmp_path: Path, storage: str) -> None:
+def test_a_link_stays_and_the_bag_behind_it_is_written(run, tmp_path, storage):
     """A new one, and one that is replaced."""
     link, path = tmp_path / "link", tmp_path / "far" / "bag"
     path.parent.mkdir()
@@ -157,7 +151,7 @@ def test_a_link_stays_and_the_bag_behind_it_is_written(run: Experiment, tmp_path
     assert link.is_symlink() and sorted(file.name for file in tmp_path.iterdir()) == ["far", "link"]
 
 
-def test_a_folder_whose_metadata_are_a_link_is_not_overwritten(run: Experiment, tmp_path: Path) -> None:
+def test_a_folder_whose_metadata_are_a_link_is_not_overwritten(run, tmp_path):
     with twodof.Bag(tmp_path / "bag").begin(run):
         pass
     (tmp_path / "folder").mkdir()
@@ -168,9 +162,7 @@ def test_a_folder_whose_metadata_are_a_link_is_not_overwritten(run: Experiment, 
 
 @both_storages
 @pytest.mark.parametrize("place", ["below a file", "read-only", "long"])
-def test_folder_that_cannot_be_written_is_refused(
-    run: Experiment, tmp_path: Path, disk: Callable[..., Path], storage: str, place: str
-) -> None:
+def test_folder_that_cannot_be_written_is_refused(run, tmp_path, disk, storage, place):
     if place == "below a file":
         (tmp_path / "file").write_text("precious")
         path = tmp_path / "file" / "bag"
@@ -189,9 +181,7 @@ def test_folder_that_cannot_be_written_is_refused(
 
 @both_storages
 @pytest.mark.parametrize(("error", "n"), [(RuntimeError, 1), (KeyboardInterrupt, 137)])
-def test_exception_leaves_a_bag_with_every_sample_so_far(
-    run: Experiment, tmp_path: Path, storage: str, error: type[BaseException], n: int
-) -> None:
+def test_exception_leaves_a_bag_with_every_sample_so_far(run, tmp_path, storage, error, n):
     path = tmp_path / "bag"
     bag = twodof.Bag(path, storage=storage).begin(run)
     with pytest.raises(error, match="enough"), bag:
@@ -203,7 +193,7 @@ def test_exception_leaves_a_bag_with_every_sample_so_far(
 
 
 @both_storages
-def test_a_run_that_fails_before_its_first_sample_leaves_no_bag(run: Experiment, tmp_path: Path, storage: str) -> None:
+def test_a_run_that_fails_before_its_first_sample_leaves_no_bag(run, tmp_path, storage):
     with pytest.raises(BuildError, match="enough"), twodof.Bag(tmp_path / "bag", storage=storage).begin(run):
         raise BuildError("enough")
     assert not (tmp_path / "bag").exists()
@@ -221,9 +211,7 @@ def fill(bag: twodof.Bag, run: Experiment) -> tuple[str, int]:
 
 @both_storages
 @pytest.mark.parametrize("size", [2252, 3072])  # KiB: 2.2 and 3 MiB
-def test_full_disk_ends_in_a_closed_bag_with_every_sample(
-    run: Experiment, disk: Callable[..., Path], storage: str, size: int
-) -> None:
+def test_full_disk_ends_in_a_closed_bag_with_every_sample(run, disk, storage, size):
     path = disk(size) / "bag"
     said, taken = fill(twodof.Bag(path, storage=storage), run)
     assert "disk is full" in said
@@ -234,9 +222,7 @@ def test_full_disk_ends_in_a_closed_bag_with_every_sample(
 
 
 @both_storages
-def test_disk_too_small_to_begin_with_is_left_as_it_was(
-    run: Experiment, disk: Callable[..., Path], storage: str
-) -> None:
+def test_disk_too_small_to_begin_with_is_left_as_it_was(run, disk, storage):
     refused = 0
     for size in (4, 16, 512, *range(2048, 2128, 8)):
         path = disk(size) / "bag"
@@ -253,9 +239,7 @@ def test_disk_too_small_to_begin_with_is_left_as_it_was(
 
 
 @both_storages
-def test_reserve_is_room_to_close_a_run_that_was_never_flushed(
-    run: Experiment, disk: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, storage: str
-) -> None:
+def test_reserve_is_room_to_close_a_run_that_was_never_flushed(run, disk, monkeypatch, storage):
     monkeypatch.setattr("twodof.bag.store.FLUSH_PERIOD", 1e6)
     path = disk(2140) / "bag"  # 92 KiB beside the reserve; the messages take 140
     with twodof.Bag(path, storage=storage).begin(run) as bag:
@@ -268,7 +252,7 @@ def test_reserve_is_room_to_close_a_run_that_was_never_flushed(
 
 
 @both_storages
-def test_messages_reach_the_disk_while_the_fmu_takes_its_time(run: Experiment, tmp_path: Path, storage: str) -> None:
+def test_messages_reach_the_disk_while_the_fmu_takes_its_time(run, tmp_path, storage):
     """Fewer than fill a buffer, and no more come."""
     with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         for k in range(50):
@@ -313,7 +297,7 @@ print(memory.growth)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @both_storages
-def test_memory_does_not_grow_with_the_run(native_path: Path, tmp_path: Path, storage: str) -> None:
+def test_memory_does_not_grow_with_the_run(native_path, tmp_path, storage):
     command = [sys.executable, "-c", MEMORY, str(native_path), str(tmp_path / "bag"), storage]
     done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 5 * MIB
@@ -321,7 +305,7 @@ def test_memory_does_not_grow_with_the_run(native_path: Path, tmp_path: Path, st
 
 
 @both_storages
-def test_fsync_waits_for_the_disk_at_each_flush(run: Experiment, tmp_path: Path, storage: str) -> None:
+def test_fsync_waits_for_the_disk_at_each_flush(run, tmp_path, storage):
     """Seen in the system calls of the process."""
     script = """
 import sys

@@ -1,12 +1,10 @@
 """Results of the benchmarks other than times: all engines compute the same."""
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +19,7 @@ Mujoco = Callable[[str, int], tuple[float, list[float]]]
 
 
 @pytest.fixture(scope="module")
-def benchmarks() -> Iterator[SimpleNamespace]:
+def benchmarks():
     """Their modules: the folder is no package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(BENCHMARKS)
@@ -31,7 +29,7 @@ def benchmarks() -> Iterator[SimpleNamespace]:
         del sys.modules[name]
 
 
-def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmarks: SimpleNamespace) -> None:
+def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmarks):
     steps, h = benchmarks.steps, benchmarks.arms.STEP
     e = np.array([steps.exact(k) - steps.X_DES for k in range(0, 500)])
     np.testing.assert_allclose(e[0], steps.position(steps.Q_START) - steps.X_DES)
@@ -42,9 +40,7 @@ def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmarks: Simple
     np.testing.assert_allclose(e[1], e[0] * (fast * b - slow * a) / (fast - slow), rtol=1e-13)
 
 
-def test_listing_is_off_by_centimetres_and_an_fmu_is_not(
-    benchmarks: SimpleNamespace, native_path: Path, tmp_path: Path
-) -> None:
+def test_listing_is_off_by_centimetres_and_an_fmu_is_not(benchmarks, native_path, tmp_path):
     steps = benchmarks.steps
     assert 0.035 <= steps.accuracy(steps.Listing()) <= 0.055
     fmu = steps.FmuInFmpy(native_path, tmp_path, outputs=True)
@@ -53,7 +49,7 @@ def test_listing_is_off_by_centimetres_and_an_fmu_is_not(
     fmu.free()
 
 
-def test_robots_are_measured_as_they_come(benchmarks: SimpleNamespace, robots: Path) -> None:
+def test_robots_are_measured_as_they_come(benchmarks, robots):
     urdf = ET.parse(robots / "panda_description/urdf/panda.urdf")
     damping = [
         float(dynamics.attrib["damping"])
@@ -65,12 +61,12 @@ def test_robots_are_measured_as_they_come(benchmarks: SimpleNamespace, robots: P
 
 
 @pytest.fixture(scope="module")
-def mujoco(benchmarks: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Mujoco:
+def mujoco(benchmarks, tmp_path_factory):
     needs("gcc")
     return benchmarks.engine.mujoco_runner(tmp_path_factory.mktemp("mujoco"))
 
 
-def test_mujoco_has_the_same_arm(benchmarks: SimpleNamespace, mujoco: Mujoco) -> None:
+def test_mujoco_has_the_same_arm(benchmarks, mujoco):
     """Free fall from the start: MuJoCo's motion is that of Pinocchio's dynamics."""
     model = benchmarks.arms.shipped_arm().robot.model.copy()
     model.gravity.linear = np.array(benchmarks.arms.STARTS["gravity"])
@@ -84,19 +80,19 @@ def test_mujoco_has_the_same_arm(benchmarks: SimpleNamespace, mujoco: Mujoco) ->
     assert mujoco("free", 30)[1] == pytest.approx(expected, abs=1e-7)
 
 
-def test_mujoco_has_the_same_controller(benchmarks: SimpleNamespace, mujoco: Mujoco) -> None:
+def test_mujoco_has_the_same_controller(benchmarks, mujoco):
     for steps in (1, 50, 500):
         x = benchmarks.steps.position(mujoco("controlled", steps)[1])
         assert x == pytest.approx(benchmarks.steps.exact(steps), abs=1e-9)
 
 
-def test_mujoco_is_measured_without_its_python_package() -> None:
+def test_mujoco_is_measured_without_its_python_package():
     """It makes the library ask for the time, at more than the cost of a step."""
     code = "import sys, engine; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True)
 
 
-def test_the_rival_has_the_same_right_hand_side(benchmarks: SimpleNamespace) -> None:
+def test_the_rival_has_the_same_right_hand_side(benchmarks):
     arm = benchmarks.arms.chain(4)
     plant = benchmarks.arms.Plant(
         arm.robot, benchmarks.arms.variable_table(arm.robot, {**arm.starts, "tau_ext": (0.1,) * 4})
@@ -110,14 +106,14 @@ def test_the_rival_has_the_same_right_hand_side(benchmarks: SimpleNamespace) -> 
         np.testing.assert_allclose(np.array(rival).ravel(), expected, rtol=1e-9)
 
 
-def test_the_engine_is_timed_in_c(benchmarks: SimpleNamespace, tmp_path: Path) -> None:
+def test_the_engine_is_timed_in_c(benchmarks, tmp_path):
     arm = benchmarks.arms.shipped_arm()
     costs = [benchmarks.arms.native_cost(arm, tmp_path)()]
     costs += benchmarks.engine.derivative_costs(benchmarks.arms.shipped_arm("pose"), tmp_path, 100)
     assert all(0.0 < cost < 1e-3 for cost in costs)
 
 
-def test_a_plan_differs_from_the_fmu_by_runge_kuttas_error(benchmarks: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_plan_differs_from_the_fmu_by_runge_kuttas_error(benchmarks, tmp_path):
     """A method of the fourth order: sixteen steps instead of one divide the error by 16⁴."""
     mpc = benchmarks.mpc
     fmu, sides = mpc.models(tmp_path)
@@ -128,12 +124,12 @@ def test_a_plan_differs_from_the_fmu_by_runge_kuttas_error(benchmarks: SimpleNam
     assert 0.5 < error / fine / 16**4 < 2.0
 
 
-def test_growth_is_the_largest_exponent(benchmarks: SimpleNamespace) -> None:
+def test_growth_is_the_largest_exponent(benchmarks):
     growth = benchmarks.engine.growth
     assert growth([2, 7, 16], [4.0, 49.0, 256.0]) == pytest.approx(2.0)
     assert growth([1, 2, 4], [1.0, 2.0, 16.0]) == pytest.approx(3.0)
 
 
-def test_tables_are_aligned(benchmarks: SimpleNamespace, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_are_aligned(benchmarks, capsys):
     benchmarks.report.print_rows("of all", ("", "time"), ("a", "1 s"), ("bcd", "10 s"))
     assert capsys.readouterr().out == "\nof all\n\n       time\n  a     1 s\n  bcd  10 s\n"

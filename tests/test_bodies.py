@@ -1,7 +1,5 @@
 """A robot's constants in Denavit-Hartenberg frames, compared with Pinocchio."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """The command line without errors: its output and its files."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -31,7 +29,7 @@ def twodof_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def session(tmp_path_factory):
     """Return the output of a session that builds, runs and shows."""
     cwd = tmp_path_factory.mktemp("session")
     outputs = {"cwd": str(cwd)}
@@ -55,7 +53,7 @@ def rows(output: str) -> dict[str, str]:
     return dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())
 
 
-def test_build_says_what_it_built_and_what_to_do_next(session: dict[str, str]) -> None:
+def test_build_says_what_it_built_and_what_to_do_next(session):
     found = rows(session["build"])
     size = (Path(session["cwd"]) / "TwoDof.fmu").stat().st_size / 1024
     assert found["FMU"] == f"TwoDof.fmu ({size:.0f} KB, linux64)"
@@ -64,7 +62,7 @@ def test_build_says_what_it_built_and_what_to_do_next(session: dict[str, str]) -
     assert "twodof run TwoDof.fmu" in session["build"].partition("\nnext\n")[2]
 
 
-def test_run_leaves_the_messages_that_it_promises(session: dict[str, str]) -> None:
+def test_run_leaves_the_messages_that_it_promises(session):
     found = rows(session["run"])
     bag = twodof.read_bag(Path(session["cwd"]) / "bag")
     promised = re.fullmatch(r"bag \((\d+) messages on /joint_states, mcap\)", found["bag"])
@@ -74,7 +72,7 @@ def test_run_leaves_the_messages_that_it_promises(session: dict[str, str]) -> No
     assert bag.stamps[0] == 1000 * 10**9
 
 
-def test_run_says_how_far_the_end_effector_is_from_its_target(session: dict[str, str]) -> None:
+def test_run_says_how_far_the_end_effector_is_from_its_target(session):
     found = rows(session["run"])["verdict"]
     promised = re.match(r"not reached: (\S+) m from the target \(0.2, 0.05\) m; the position still approaches", found)
     assert promised is not None
@@ -84,7 +82,7 @@ def test_run_says_how_far_the_end_effector_is_from_its_target(session: dict[str,
     assert float(promised[1]) == pytest.approx(math.dist(x, (0.2, 0.05)), rel=5e-3)
 
 
-def test_run_says_how_fast_it_was_and_what_to_do_next(session: dict[str, str]) -> None:
+def test_run_says_how_fast_it_was_and_what_to_do_next(session):
     timing = re.fullmatch(r"1\.5 s simulated in ([\d.]+) s, ([\d.]+) × real time", rows(session["run"])["time"])
     assert timing is not None
     assert float(timing[2]) == pytest.approx(1.5 / float(timing[1]), rel=0.1)
@@ -94,7 +92,7 @@ def test_run_says_how_fast_it_was_and_what_to_do_next(session: dict[str, str]) -
 
 @pytest.mark.parametrize("activated", [True, False])
 @pytest.mark.parametrize("missing", [[], ["matplotlib", "websockets"]])
-def test_what_is_suggested_can_be_typed(activated: bool, missing: list[str], native_path: Path, tmp_path: Path) -> None:
+def test_what_is_suggested_can_be_typed(activated, missing, native_path, tmp_path):
     """In a shell that finds the program or does not, with and without figures and pages."""
     here = str(Path(sys.executable).parent)
     path = [p for p in os.environ["PATH"].split(os.pathsep) if Path(p) != Path(here)]
@@ -119,7 +117,7 @@ def test_what_is_suggested_can_be_typed(activated: bool, missing: list[str], nat
     assert not re.search(r"(?<!/)twodof\[", done.stdout)  # a folder, no name for an index
 
 
-def test_info_of_a_bag_shows_what_is_in_it(session: dict[str, str]) -> None:
+def test_info_of_a_bag_shows_what_is_in_it(session):
     found = rows(session["info bag"])
     bag = twodof.read_bag(Path(session["cwd"]) / "bag")
     assert found["joints"] == "joint1, joint2"
@@ -133,7 +131,7 @@ def test_info_of_a_bag_shows_what_is_in_it(session: dict[str, str]) -> None:
     assert topics == ["/joint_states", "151", "sensor_msgs/msg/JointState"]
 
 
-def test_info_of_an_fmu_shows_what_is_in_it(session: dict[str, str]) -> None:
+def test_info_of_an_fmu_shows_what_is_in_it(session):
     found = rows(session["info fmu"])
     assert found["digest"] == twodof.load_fmu(Path(session["cwd"]) / "TwoDof.fmu").guid
     assert found["platforms"] == "linux64"
@@ -151,7 +149,7 @@ def test_info_of_an_fmu_shows_what_is_in_it(session: dict[str, str]) -> None:
         assert re.search(f"^{line}$", table, re.MULTILINE), line
 
 
-def test_default_run_builds_the_fmu_again_only_if_it_differs(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_default_run_builds_the_fmu_again_only_if_it_differs(folder, capfd):
     fmu_file = folder / "TwoDof.fmu"
 
     def run(bag: str) -> int:
@@ -172,16 +170,14 @@ def test_default_run_builds_the_fmu_again_only_if_it_differs(folder: Path, capfd
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_overwrite_replaces_a_bag(storage: str, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_overwrite_replaces_a_bag(storage, folder, capfd):
     assert main([*RUN, "-o", "bag"]) == 0
     assert main([*RUN, "-o", "bag", "--overwrite", "--stop-time", "0.04", "--storage", storage]) == 0
     assert len(twodof.read_bag("bag").t) == 5
     assert capfd.readouterr().err == ""
 
 
-def test_bag_without_a_name_is_named_after_the_date(
-    folder: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bag_without_a_name_is_named_after_the_date(folder, capfd, monkeypatch):
     """And a second one of the same second has a name of its own."""
     run = ["run", "arm.fmu", "--stop-time", "0.01"]
     assert main(run) == 0
@@ -198,21 +194,21 @@ def test_bag_without_a_name_is_named_after_the_date(
     [["build", "-o", "far.fmu", "--q-start", "9", "0"], [*RUN, "--set", "q_start=9,0"]],
     ids=lambda command: command[0],
 )
-def test_warnings_of_the_robot_and_the_fmu_are_shown(command: list[str], folder: Path) -> None:
+def test_warnings_of_the_robot_and_the_fmu_are_shown(command, folder):
     done = twodof_command(*command, cwd=folder)
     assert done.returncode == 0
     (line,) = done.stderr.splitlines()
     assert re.match(r"WARNING: q_start\[1\] = 9 of joint 'joint1' is outside its lim", line)
 
 
-def test_what_the_fmu_refuses_is_one_line_and_leaves_no_bag(folder: Path) -> None:
+def test_what_the_fmu_refuses_is_one_line_and_leaves_no_bag(folder):
     done = twodof_command(*RUN, "--set", "q_min=1", "--set", "q_max=0", cwd=folder)
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(r"twodof: error: .*q_min\[1\] = 1 > q_max\[1\] = 0.*\n", done.stderr)
     assert [path.name for path in folder.iterdir()] == ["arm.fmu"]
 
 
-def test_controls_are_told_in_the_words_of_the_options(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_controls_are_told_in_the_words_of_the_options(folder, capfd):
     assert main([*RUN, "--set", "quat_des=1"]) == 1
     told = "it belongs to control 'task --orientation'; this FMU has control 'task'\n"
     assert capfd.readouterr().err.endswith(told)
@@ -226,7 +222,7 @@ def test_controls_are_told_in_the_words_of_the_options(folder: Path, capfd: pyte
 
 
 @pytest.mark.parametrize("line", ["info arm.fmu", "--help", "run arm.fmu -o bag --stop-time 0.01"])
-def test_reader_that_leaves_early_gets_no_traceback(line: str, folder: Path) -> None:
+def test_reader_that_leaves_early_gets_no_traceback(line, folder):
     reading, writing = os.pipe()
     os.close(reading)
     process = subprocess.Popen(
@@ -244,11 +240,11 @@ def test_reader_that_leaves_early_gets_no_traceback(line: str, folder: Path) -> 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("arguments", ["info arm.fmu", "--help", "--version", "help run", "run --help"])
-def test_a_full_disk_under_the_output_is_an_error(arguments: str, unbuffered: str, folder: Path) -> None:
+def test_a_full_disk_under_the_output_is_an_error(arguments, unbuffered, folder):
     assert redirected(arguments, ">/dev/full", folder, unbuffered) == (1, "twodof: error: No space left on device\n")
 
 
-def test_a_closed_output_is_no_error(folder: Path) -> None:
+def test_a_closed_output_is_no_error(folder):
     assert redirected("info arm.fmu", ">&-", folder) == (0, "")
 
 
@@ -267,7 +263,7 @@ def redirected(arguments: str, redirect: str, folder: Path, unbuffered: str = ""
 
 
 @pytest.mark.parametrize("verb", ["", *(verb.__name__.rpartition(".")[2] for verb in VERBS)])
-def test_help_is_told_in_two_ways(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_is_told_in_two_ways(verb, capsys):
     assert main(["help", verb] if verb else ["help"]) == 0
     out = capsys.readouterr().out
     with pytest.raises(SystemExit) as end:
@@ -276,7 +272,7 @@ def test_help_is_told_in_two_ways(verb: str, capsys: pytest.CaptureFixture[str])
     assert out.startswith(f"usage: twodof {verb}")
 
 
-def test_facts_as_json(native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_facts_as_json(native_path, tmp_path, capsys):
     def facts(*arguments: object) -> dict[str, object]:
         assert main([*map(str, arguments), "--json"]) == 0
         told: dict[str, object] = json.loads(capsys.readouterr().out)
@@ -296,9 +292,7 @@ def test_facts_as_json(native_path: Path, tmp_path: Path, capsys: pytest.Capture
     assert facts("info", table)["best"] == swept["best"]
 
 
-def test_messages_name_arguments_in_python_and_options_on_the_command_line(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_messages_name_arguments_in_python_and_options_on_the_command_line(native_path, tmp_path, capsys):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.01)
     with pytest.raises(twodof.TwoDofError, match=r"`path` or give `overwrite=True`"):
         twodof.Bag(tmp_path / "bag")
@@ -306,9 +300,7 @@ def test_messages_name_arguments_in_python_and_options_on_the_command_line(
     assert "choose another with -o or give --overwrite" in capsys.readouterr().err
 
 
-def test_one_value_for_a_vector_says_that_it_was_spread(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_value_for_a_vector_says_that_it_was_spread(native_path, tmp_path, capsys):
     options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--set", "Kp=60"]
     assert main(["run", str(native_path), *options]) == 0
     assert "Kp       60, all 2 elements\n" in capsys.readouterr().out
@@ -316,7 +308,7 @@ def test_one_value_for_a_vector_says_that_it_was_spread(
     assert given["Kp[1]"] == given["Kp[2]"] == 60.0
 
 
-def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_path: Path, tmp_path: Path) -> None:
+def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_path, tmp_path):
     answer, urdf = tmp_path / "answer", Path(__file__).parents[1] / "urdf/2dof.urdf"
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.02)
     for line, expected in {
@@ -348,7 +340,7 @@ def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_pa
 
 
 @pytest.mark.parametrize("verb", EXAMPLES)
-def test_the_examples_of_each_help_are_commands(verb: str) -> None:
+def test_the_examples_of_each_help_are_commands(verb):
     program, verbs = parser()
     assert EXAMPLES[verb] and {*EXAMPLES} == {"", *verbs} - {"help"}
     for line in EXAMPLES[verb]:
@@ -358,7 +350,7 @@ def test_the_examples_of_each_help_are_commands(verb: str) -> None:
         assert f"  {line}\n" in verbs.get(verb, program).format_help()
 
 
-def test_a_compiler_that_works_is_seen_working(tmp_path: Path) -> None:
+def test_a_compiler_that_works_is_seen_working(tmp_path):
     """A line within a second, seconds on a terminal, and at the end a line that is clear."""
     code = "import time; from twodof.cli.printing import busy\nwith busy('compiling'): time.sleep(1.7)"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
@@ -375,7 +367,7 @@ def test_a_compiler_that_works_is_seen_working(tmp_path: Path) -> None:
     assert shown.stdout.endswith("\x1b[K")
 
 
-def test_help_texts_are_phrases_that_stand_alone() -> None:
+def test_help_texts_are_phrases_that_stand_alone():
     """A default or a unit by itself tells nothing about an option."""
     for verb, its_parser in parser()[1].items():
         for action in its_parser._actions:

@@ -1,10 +1,7 @@
 """Commands of ROS 2 messages, which rosbags serialises."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +17,7 @@ Build = Callable[..., twodof.Fmu]
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Build:
+def arm(tmp_path_factory):
     """The default arm under a control, described and not compiled."""
 
     def build(control: str) -> twodof.Fmu:
@@ -44,7 +41,7 @@ def joint_state(
     return bytes(STORE.serialize_cdr(STORE.types[JOINT_STATE](header, [*names], *arrays), JOINT_STATE))
 
 
-def test_joints_are_matched_by_name_in_any_order_and_number(arm: Build) -> None:
+def test_joints_are_matched_by_name_in_any_order_and_number(arm):
     joint, effort = Commands(arm("joint")), Commands(arm("effort"))
     both = joint_state(("joint2", "joint1"), (0.2, 0.1), (2.0, 1.0), (20.0, 10.0), (3, 4))
     stamp, inputs, unknown_joints = joint.read(JOINT_STATE, both)
@@ -75,13 +72,13 @@ NAMES = ("joint1", "joint2")
         ("joint", bytes(MAX_COMMAND + 1), "bytes", f"it has {MAX_COMMAND + 1} bytes"),
     ],
 )
-def test_what_is_no_command(arm: Build, control: str, cdr: bytes, kind: str, text: str) -> None:
+def test_what_is_no_command(arm, control, cdr, kind, text):
     with pytest.raises(CommandError, match=text) as caught:
         Commands(arm(control)).read(JOINT_STATE, cdr)
     assert caught.value.kind == kind
 
 
-def test_what_a_control_follows(arm: Build, fmu_path: Path) -> None:
+def test_what_a_control_follows(arm, fmu_path):
     types = {c: Commands(arm(c)).types for c in ("joint", "effort")}
     assert types == {"joint": (JOINT_STATE,), "effort": (JOINT_STATE,)}
     assert Commands(twodof.load_fmu(fmu_path)).types == (POINT,)
@@ -91,7 +88,7 @@ def asked_each_tenth(dog: Watchdog, seconds: float) -> list[Any]:
     return [dog.asked(k / 10) for k in range(round(10 * seconds))]
 
 
-def test_efforts_are_ramped_to_zero(arm: Build, caplog: pytest.LogCaptureFixture) -> None:
+def test_efforts_are_ramped_to_zero(arm, caplog):
     dog = Watchdog(arm("effort"), timeout=0.5)
     assert not any(asked_each_tenth(dog, 5))  # before the first command
     with caplog.at_level(logging.WARNING, "twodof"):
@@ -107,7 +104,7 @@ def test_efforts_are_ramped_to_zero(arm: Build, caplog: pytest.LogCaptureFixture
     assert "no command for 0.5 s: efforts go to 0" in record.message
 
 
-def test_targets_are_held_without_their_velocity(arm: Build) -> None:
+def test_targets_are_held_without_their_velocity(arm):
     dog = Watchdog(arm("joint"), timeout=0.5)
     dog.received(1.0, {"q_des[1]": 0.3, "v_des[1]": 2.0})
     assert dog.asked(1.4) == {}

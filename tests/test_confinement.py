@@ -1,7 +1,5 @@
 """A confined child process can use the files that it was given, and nothing else of the system."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os
@@ -81,7 +79,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("name", ATTEMPTS)
-def test_nothing_but_what_is_given(name: str, tmp_path: Path) -> None:
+def test_nothing_but_what_is_given(name, tmp_path):
     folder = tmp_path / "given"
     folder.mkdir()
     (folder / "mesh").write_bytes(b"mesh")
@@ -105,12 +103,12 @@ def sleep(pipe: Connection) -> None:
     time.sleep(1000)
 
 
-def test_a_parser_without_end_is_ended() -> None:
+def test_a_parser_without_end_is_ended():
     with Child(spin) as child, pytest.raises(EOFError, match="CPU time limit exceeded"):
         child.receive(100, 60)
 
 
-def test_a_parser_that_waits_or_floods_is_ended() -> None:
+def test_a_parser_that_waits_or_floods_is_ended():
     with Child(sleep) as child:
         assert child.receive(5, 60) == b"awake"
         with pytest.raises(EOFError, match="Killed"):

@@ -6,8 +6,6 @@ what needs ROS 2, a display, a network or minutes is fenced as ``console``, outp
 All that is not run is left blank in the script, so that its line numbers are those of the page.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import runpy
@@ -110,7 +108,7 @@ def with_commands(page: Path) -> bool:
 
 
 @pytest.mark.parametrize("page", [*filter(with_commands, PAGES)], ids=lambda page: page.name)
-def test_commands_and_programs_run_in_the_order_of_the_text(page: Path, tmp_path: Path) -> None:
+def test_commands_and_programs_run_in_the_order_of_the_text(page, tmp_path):
     done = run_page(page.read_text("utf-8"), page.name, tmp_path)
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stderr
@@ -129,7 +127,7 @@ def test_commands_and_programs_run_in_the_order_of_the_text(page: Path, tmp_path
         ("```sh\necho a | grep b\n```\n\n```sh\ntouch after\n```\n", "page.md:2: grep b"),
     ],
 )
-def test_a_page_that_fails_names_the_line(text: str, line: str, tmp_path: Path) -> None:
+def test_a_page_that_fails_names_the_line(text, line, tmp_path):
     done = run_page(text, "page.md", tmp_path)
     assert done.returncode != 0
     assert line in done.stderr
@@ -137,7 +135,7 @@ def test_a_page_that_fails_names_the_line(text: str, line: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
-def test_every_block_is_of_a_known_kind(page: Path) -> None:
+def test_every_block_is_of_a_known_kind(page):
     for block in blocks(page.read_text("utf-8")):
         assert block.language in FENCES, f"{page.name}:{block.line}"
         if block.language == "sh":  # of 'a && b' the shell lets 'a' fail
@@ -151,7 +149,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")) + PAGES[1:], ids=lambda page: page.name)
-def test_relative_links_lead_somewhere(page: Path) -> None:
+def test_relative_links_lead_somewhere(page):
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
         if re.match("[a-z]+:", link):
             continue
@@ -162,7 +160,7 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_tables_that_programs_printed_name_their_commit(page: Path) -> None:
+def test_tables_that_programs_printed_name_their_commit(page):
     text = page.read_text("utf-8")
     cells = ([cell.strip() for cell in line.split("|")[1:]] for line in text.splitlines())
     number = re.compile(r"\d[\d.e-]*(?: [a-zµ]+)?")
@@ -170,7 +168,7 @@ def test_tables_that_programs_printed_name_their_commit(page: Path) -> None:
     assert not printed or re.search(r"printed at commit\n?\s?`[0-9a-f]{7,}`", text), printed[0]
 
 
-def test_paths_of_the_map_are_there() -> None:
+def test_paths_of_the_map_are_there():
     readme = (ROOT / "README.md").read_text("utf-8").partition("## Map\n")[2]
     rows = re.findall(r"^[|] (`.+?) [|] (.+) [|]$", readme, re.MULTILINE)
     assert len(rows) > 10
@@ -183,20 +181,20 @@ def test_paths_of_the_map_are_there() -> None:
         assert all((base / name).exists() for name in inside), what
 
 
-def test_readme_is_short_and_has_the_command_of_the_tests() -> None:
+def test_readme_is_short_and_has_the_command_of_the_tests():
     readme = (ROOT / "README.md").read_bytes()
     assert len(readme) <= MAX_README
     command = "python3 -m venv .venv && .venv/bin/pip install '.[test]' && .venv/bin/pytest"
     assert f"\n    {command}\n".encode() in readme  # .ci/run takes it from there
 
 
-def test_every_public_name_is_on_the_page_of_functions() -> None:
+def test_every_public_name_is_on_the_page_of_functions():
     told = re.findall(r"^::: twodof\.(\w+)$", (DOCS / "api.md").read_text("utf-8"), re.MULTILINE)
     assert len(told) == len(set(told))
     assert {*told, "__version__"} == set(dir(twodof))
 
 
-def test_every_module_is_in_the_architecture() -> None:
+def test_every_module_is_in_the_architecture():
     text = (DOCS / "architecture.md").read_text("utf-8")
     verbs = {f"{verb.__name__.rpartition('.')[2]}.py" for verb in VERBS}  # as the text says
     for file in (ROOT / "twodof").rglob("*.py"):
@@ -205,7 +203,7 @@ def test_every_module_is_in_the_architecture() -> None:
     assert rooms == [*ROOMS][-len(rooms) :] and len(rooms) > 10
 
 
-def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
+def test_site_is_built_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS)
     assert done.returncode == 0, done.stderr
@@ -219,14 +217,14 @@ def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")) + PAGES[1:], ids=lambda page: page.name)
-def test_lines_of_running_text_have_at_most_120_characters(page: Path) -> None:
+def test_lines_of_running_text_have_at_most_120_characters(page):
     """Rows of tables and lines of programs cannot be broken."""
     text = page.read_text("utf-8").splitlines()
     code = {block.line + i - 1 for block in blocks(page.read_text("utf-8")) for i in range(len(block.lines))}
     assert not [i + 1 for i, line in enumerate(text) if len(line) > 120 and i not in code and line[:1] != "|"]
 
 
-def test_diagrams_of_the_architecture_are_current() -> None:
+def test_diagrams_of_the_architecture_are_current():
     """Otherwise run docs/make_diagrams.py."""
     page = (DOCS / "architecture.md").read_text("utf-8")
     for path, content in runpy.run_path(str(DOCS / "make_diagrams.py"))["diagrams"]().items():
@@ -234,7 +232,7 @@ def test_diagrams_of_the_architecture_are_current() -> None:
         assert f"]({path.name})" in page
 
 
-def test_invariants_name_the_tests_that_hold_them() -> None:
+def test_invariants_name_the_tests_that_hold_them():
     lines = re.findall(r"^Invariant: .*", (DOCS / "architecture.md").read_text("utf-8"), re.MULTILINE)
     tests = [re.search(r"\(`(test_\w+\.py)`\)\.$", line) for line in lines]
     assert len(lines) >= 8

@@ -1,7 +1,5 @@
 """A run ends cleanly after signals, on a full disk, and when its folder or reader disappears."""
 
-from __future__ import annotations
-
 import os
 import random
 import re
@@ -10,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -66,7 +64,7 @@ SIGNALS = {
 @pytest.mark.parametrize(
     ("name", "storage", "pace"), [*zip(SIGNALS, STORAGES * 3, ("--realtime", "", "", "--realtime", "--realtime", ""))]
 )
-def test_signals_leave_a_complete_bag(native_path: Path, tmp_path: Path, name: str, storage: str, pace: str) -> None:
+def test_signals_leave_a_complete_bag(native_path, tmp_path, name, storage, pace):
     numbers, bag = SIGNALS[name], tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, *pace.split())
     for number in numbers:
@@ -85,7 +83,7 @@ def test_signals_leave_a_complete_bag(native_path: Path, tmp_path: Path, name: s
         assert read_with_rosbags(bag) == whole(native_path, tmp_path, kept)
 
 
-def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch):
     times = iter([5.0, 5.0 + 0.5 * signals.CLEAN_UP, 5.0 + 1.5 * signals.CLEAN_UP])
     monkeypatch.setattr(signals, "_interrupts", [])
     monkeypatch.setattr(signals, "time", SimpleNamespace(monotonic=lambda: next(times)))
@@ -96,7 +94,7 @@ def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch: pytest
         signals.interrupt(signal.SIGINT, None)
 
 
-def test_what_ends_a_run_on_request_takes_its_time() -> None:
+def test_what_ends_a_run_on_request_takes_its_time():
     with signals.asked_to_stop() as asked:
         os.kill(os.getpid(), signal.SIGTERM)
         assert signal.getitimer(signal.ITIMER_REAL)[0] > 0.0  # a step that hangs is interrupted
@@ -126,7 +124,7 @@ except KeyboardInterrupt:
 
 
 @both_storages
-def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(native_path: Path, tmp_path: Path, storage: str) -> None:
+def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(native_path, tmp_path, storage):
     """Python raises KeyboardInterrupt anywhere, in the middle of a write too."""
     for i in range(3):
         bag = tmp_path / f"bag{i}"
@@ -149,7 +147,7 @@ def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(native_path: Path,
 
 @both_storages
 @pytest.mark.parametrize("how", ["removed", "moved"])
-def test_folder_that_goes_under_the_run_ends_it(native_path: Path, tmp_path: Path, storage: str, how: str) -> None:
+def test_folder_that_goes_under_the_run_ends_it(native_path, tmp_path, storage, how):
     bag = tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, "--realtime")
     if how == "removed":
@@ -169,9 +167,7 @@ def test_folder_that_goes_under_the_run_ends_it(native_path: Path, tmp_path: Pat
 
 @pytest.mark.long
 @both_storages
-def test_full_disk_costs_a_second_at_most(
-    native_path: Path, tmp_path: Path, disk: Callable[..., Path], storage: str, length: Callable[[int, int], int]
-) -> None:
+def test_full_disk_costs_a_second_at_most(native_path, tmp_path, disk, storage, length):
     """Somebody else fills the disk to the last byte under a run in real time."""
     expected = whole(native_path, tmp_path, 1000)
     rng = random.Random(storage)
@@ -196,7 +192,7 @@ def test_full_disk_costs_a_second_at_most(
     assert max(lost) <= 1.0
 
 
-def test_reader_of_the_summary_that_leaves_costs_no_sample(native_path: Path, tmp_path: Path) -> None:
+def test_reader_of_the_summary_that_leaves_costs_no_sample(native_path, tmp_path):
     reading, writing = os.pipe()
     os.close(reading)
     command = [*TWODOF, "run", str(native_path), "-o", str(tmp_path / "bag")]
@@ -206,9 +202,7 @@ def test_reader_of_the_summary_that_leaves_costs_no_sample(native_path: Path, tm
     assert assert_consistent(tmp_path / "bag", "mcap") == 501
 
 
-def test_interrupt_while_a_file_is_closed_is_an_interrupt(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interrupt_while_a_file_is_closed_is_an_interrupt(monkeypatch, capsys):
     """As in ``shutil.rmtree``, which closes a folder once more if it does not know that it has."""
 
     def verb(_options: object) -> int:
@@ -256,7 +250,7 @@ sys.exit(main(["info", FMU]))
         ("fmpy", True, "twodof: error: interrupted\n"),
     ],
 )
-def test_an_interrupted_import_is_quiet(native_path: Path, module: str, as_c_does: bool, said: str) -> None:
+def test_an_interrupted_import_is_quiet(native_path, module, as_c_does, said):
     given = f"MODULE, AS_C_DOES, FMU = {module!r}, {as_c_does}, {str(native_path)!r}"
     command = [sys.executable, "-c", given + INTERRUPTED_IMPORT]
     done = subprocess.run(command, capture_output=True, text=True)

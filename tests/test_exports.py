@@ -1,9 +1,6 @@
 """Exports of bags as tables and single files, by independent readers; compressed chunks."""
 
-from __future__ import annotations
-
 import csv
-from pathlib import Path
 
 import duckdb
 import numpy as np
@@ -18,7 +15,7 @@ from twodof.cli.main import main
 
 
 @pytest.fixture(scope="module")
-def bag_path(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag_path(native_path, tmp_path_factory):
     path = tmp_path_factory.mktemp("bag") / "bag"
     changes = [(0.25, {"x_des": (0.1, 0.2)})]
     twodof.simulate(native_path, twodof.Bag(path, scene=True, effort=True), stop_time=0.5, changes=changes)
@@ -37,7 +34,7 @@ def columns(bag: twodof.Recording) -> np.ndarray:
     return np.column_stack([bag.t, *joints, bag.x, bag.target])
 
 
-def test_a_csv_has_each_value_to_the_last_bit(bag_path: Path, tmp_path: Path) -> None:
+def test_a_csv_has_each_value_to_the_last_bit(bag_path, tmp_path):
     assert main(["export", str(bag_path), "-o", str(tmp_path / "out.csv")]) == 0
     with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as file:
         header, *rows = csv.reader(file)
@@ -45,7 +42,7 @@ def test_a_csv_has_each_value_to_the_last_bit(bag_path: Path, tmp_path: Path) ->
     assert np.array_equal(np.array(rows, float), columns(twodof.read_bag(bag_path)))
 
 
-def test_a_parquet_file_is_read_by_another_program(bag_path: Path, tmp_path: Path) -> None:
+def test_a_parquet_file_is_read_by_another_program(bag_path, tmp_path):
     path = twodof.export_bag(bag_path, tmp_path / "out.parquet")
     found = duckdb.read_parquet(str(path))
     assert found.columns == NAMES
@@ -54,7 +51,7 @@ def test_a_parquet_file_is_read_by_another_program(bag_path: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_one_mcap_file_has_all_messages(storage: str, native_path: Path, tmp_path: Path) -> None:
+def test_one_mcap_file_has_all_messages(storage, native_path, tmp_path):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag", storage=storage, scene=True), stop_time=0.3)
     path = twodof.export_bag(tmp_path / "bag", tmp_path / "out.mcap")
     with path.open("rb") as file:
@@ -70,13 +67,13 @@ def test_one_mcap_file_has_all_messages(storage: str, native_path: Path, tmp_pat
     ("name", "message"),
     [("out.xlsx", "ends in .csv, .parquet or .mcap"), ("none/out.csv", "cannot write '.*none/out.csv'")],
 )
-def test_what_cannot_be_exported_is_refused(name: str, message: str, bag_path: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_exported_is_refused(name, message, bag_path, tmp_path):
     with pytest.raises(twodof.TwoDofError, match=message):
         twodof.export_bag(bag_path, tmp_path / name)
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path: Path, tmp_path: Path) -> None:
+def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path, tmp_path):
     """A robot at rest too, whose messages compress a thousandfold."""
     for name, step in {"moving": 0.01, "resting": 0.001}.items():
         bags = [tmp_path / name, tmp_path / f"{name}.zstd"]

@@ -1,7 +1,5 @@
 """The public face of the package: names, types, one-line reprs, and missing extras."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil
@@ -10,7 +8,6 @@ import re
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -60,7 +57,7 @@ assert not [name for name in sys.modules if name.startswith("pinocchio.")]
 """
 
 
-def test_names_are_the_public_ones_and_no_module_takes_their_place() -> None:
+def test_names_are_the_public_ones_and_no_module_takes_their_place():
     for module in pkgutil.walk_packages(twodof.__path__, "twodof."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
@@ -72,7 +69,7 @@ def test_names_are_the_public_ones_and_no_module_takes_their_place() -> None:
         assert name == "__version__" or value.__name__ == name
 
 
-def test_a_users_program_is_checked_by_its_types(tmp_path: Path) -> None:
+def test_a_users_program_is_checked_by_its_types(tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
     cache = f"--cache-dir={Path(__file__).parents[1] / '.mypy_cache'}"
     command = [sys.executable, "-m", "mypy", "--strict", cache, "program.py"]
@@ -119,14 +116,12 @@ def test_a_users_program_is_checked_by_its_types(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_keyword_that_is_none_is_told_of_the_function_that_was_called(
-    call: Callable[[Path], object], told: str, native_path: Path
-) -> None:
+def test_a_keyword_that_is_none_is_told_of_the_function_that_was_called(call, told, native_path):
     with pytest.raises(TypeError, match=f"^{told}"):
         call(native_path)
 
 
-def test_public_signatures_name_every_keyword() -> None:
+def test_public_signatures_name_every_keyword():
     """An editor and ``help`` show names, types and defaults."""
     for name in dir(twodof):
         public = getattr(twodof, name)
@@ -141,7 +136,7 @@ def test_public_signatures_name_every_keyword() -> None:
     assert {"stop_time", "settings", "steer"} <= inspect.signature(twodof.run).parameters.keys()
 
 
-def test_help_begins_with_every_name_of_the_package() -> None:
+def test_help_begins_with_every_name_of_the_package():
     page = pydoc.plain(pydoc.render_doc(twodof)).partition("PACKAGE CONTENTS")[0]
     assert "twodof.run(fmu" in page
     listed = {*re.findall(r"\w+", page.partition("Build an FMU")[2])}
@@ -149,7 +144,7 @@ def test_help_begins_with_every_name_of_the_package() -> None:
 
 
 @pytest.mark.parametrize("kind", ["fmu", "recording", "summary", "linear model", "sweep"])
-def test_a_notebook_shows_a_table_and_a_picture(kind: str, native_path: Path, tmp_path: Path) -> None:
+def test_a_notebook_shows_a_table_and_a_picture(kind, native_path, tmp_path):
     """The HTML is well-formed, has no script, and names of third parties are text in it."""
     hostile = "<script>alert(1)</script>&\"'"
     fmu = twodof.load_fmu(native_path)
@@ -171,7 +166,7 @@ def test_a_notebook_shows_a_table_and_a_picture(kind: str, native_path: Path, tm
     assert "<table" in html and re.search(r"<(polyline|circle) ", html)
 
 
-def test_the_picture_of_a_long_recording_keeps_its_extremes(native_path: Path, tmp_path: Path) -> None:
+def test_the_picture_of_a_long_recording_keeps_its_extremes(native_path, tmp_path):
     twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     bag = twodof.read_bag(tmp_path / "bag")
     q = np.zeros((100_000, 2))
@@ -181,12 +176,12 @@ def test_the_picture_of_a_long_recording_keeps_its_extremes(native_path: Path, t
     assert "-3.5 to 7.25" in html and len(html) < 30_000
 
 
-def test_a_control_that_is_none_is_told_where_it_was_typed() -> None:
+def test_a_control_that_is_none_is_told_where_it_was_typed():
     with pytest.raises(twodof.TwoDofError, match=r"^`control` 'jont' is .*; did you mean 'joint'"):
         twodof.FmuOptions(control="jont")
 
 
-def test_reprs_are_one_line(native_path: Path, tmp_path: Path) -> None:
+def test_reprs_are_one_line(native_path, tmp_path):
     run = twodof.experiment(native_path, stop_time=0.05)
     twodof.simulate(run, twodof.Bag(tmp_path / "bag"))
     bag = twodof.read_bag(tmp_path / "bag")
@@ -199,7 +194,7 @@ def test_reprs_are_one_line(native_path: Path, tmp_path: Path) -> None:
     assert repr(bag) == f"<Recording '{tmp_path / 'bag'}': 6 samples in 0.05 s of joint1, joint2>"
 
 
-def test_recording_has_what_the_samples_had(native_path: Path, tmp_path: Path) -> None:
+def test_recording_has_what_the_samples_had(native_path, tmp_path):
     samples = []
     run = twodof.experiment(native_path, stop_time=0.5)
     steps = twodof.samples(run)
@@ -234,7 +229,7 @@ def program(names: list[str], code: str, folder: Path, *arguments: object) -> st
     return done.stdout
 
 
-def test_nothing_but_building_needs_pinocchio(native_path: Path, tmp_path: Path) -> None:
+def test_nothing_but_building_needs_pinocchio(native_path, tmp_path):
     """A sweep's children inherit no modules: they find the same nothing on their path."""
     for name in ("pinocchio", "coal", "pythonfmu"):
         (tmp_path / "absent").mkdir(exist_ok=True)
@@ -263,14 +258,14 @@ for call in sys.argv[1:]:
 """
 
 
-def test_what_needs_an_extra_says_so_when_it_is_used(tmp_path: Path) -> None:
+def test_what_needs_an_extra_says_so_when_it_is_used(tmp_path):
     names = ["websockets", "matplotlib", "pyarrow", "cyclonedds"]
     errors = program(names, CALLS, tmp_path, *ABSENT).splitlines()
     for error, extra in zip(errors, ABSENT.values(), strict=True):
         assert f"extra '{extra}'" in error
 
 
-def test_times_are_those_of_the_fmus_default_experiment(native_path: Path, tmp_path: Path) -> None:
+def test_times_are_those_of_the_fmus_default_experiment(native_path, tmp_path):
     other = tmp_path / "other.fmu"
     with zipfile.ZipFile(native_path) as archive, zipfile.ZipFile(other, "w") as changed:
         for name in archive.namelist():
@@ -285,7 +280,7 @@ def test_times_are_those_of_the_fmus_default_experiment(native_path: Path, tmp_p
     assert (run.steps, run.step) == (500, 0.01)
 
 
-def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path: Path) -> None:
+def test_columns_of_a_csv_are_named_as_settings_are(native_path, tmp_path):
     (tmp_path / "in.csv").write_text("time,Kp,x_des[1]\n0,50,0.2\n0.05,80,0.1\n")
     run = twodof.experiment(native_path, stop_time=0.1, input_file=tmp_path / "in.csv")
     assert run.changes[0] == (0.05, {"Kp[1]": 80.0, "Kp[2]": 80.0, "x_des[1]": 0.1})
@@ -294,6 +289,6 @@ def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path:
         twodof.experiment(native_path, input_file=tmp_path / "in.csv")
 
 
-def test_versions_are_of_what_is_installed() -> None:
+def test_versions_are_of_what_is_installed():
     """A run without Pinocchio still records its versions."""
     assert versions("numpy", "no-such-package") == {"twodof": twodof.__version__, "numpy": np.__version__}

@@ -1,7 +1,5 @@
 """Films of bags, read by FFmpeg and Pillow: the arm is where the bag has it."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -19,7 +17,7 @@ STOP, TARGETS = 3.0, ((-0.2, 0.05), (0.1, 0.2))
 
 
 @pytest.fixture(scope="module")
-def bag(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag(native_path, tmp_path_factory):
     bag = tmp_path_factory.mktemp("film") / "bag"
     changes = [(1.0, {"x_des": TARGETS[1]})]
     settings = {"x_des": TARGETS[0], "Kp": 100.0}
@@ -55,7 +53,7 @@ def pose_box(q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("kind", "rate"), [("mp4", 30), ("webp", 30), ("gif", 25)])
-def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag: Path, tmp_path: Path, kind: str, rate: int) -> None:
+def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag, tmp_path, kind, rate):
     path = tmp_path / f"run.{kind}"
     assert main(["view", str(bag), "--export", str(path)]) == 0
     found = frames(path)
@@ -81,7 +79,7 @@ def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag: Path, tmp_path: 
         np.testing.assert_allclose(arm_box(picture), expected, atol=8.0)  # pixels of 900 in a metre
 
 
-def test_a_picture_is_the_end_of_the_run(bag: Path, tmp_path: Path) -> None:
+def test_a_picture_is_the_end_of_the_run(bag, tmp_path):
     for kind in ("png", "mp4"):
         assert main(["view", str(bag), "--export", str(tmp_path / f"run.{kind}")]) == 0
     (picture,), film = frames(tmp_path / "run.png"), frames(tmp_path / "run.mp4")
@@ -90,9 +88,7 @@ def test_a_picture_is_the_end_of_the_run(bag: Path, tmp_path: Path) -> None:
     assert off[1] < 0.5 < off[0]
 
 
-def test_what_makes_no_film_is_said(
-    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_makes_no_film_is_said(bag, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     for name, more, words in (
         ("run.avi", [], "the name of an export ends in .html, .mp4, .webp, .gif, .png"),

@@ -1,7 +1,5 @@
 """FMUs whose description was changed by hand: one line that names the culprit, for each command."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 from pathlib import Path
@@ -45,9 +43,7 @@ def forged(fmu: Path, folder: Path, pattern: str, text: str) -> Path:
         ('valueReference="1"', 'valueReference="99999"', "99999|failed"),
     ],
 )
-def test_a_forged_fmu_is_refused_in_a_line(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], pattern: str, text: str, culprit: str
-) -> None:
+def test_a_forged_fmu_is_refused_in_a_line(native_path, tmp_path, capsys, pattern, text, culprit):
     """By one of the commands at least; by the others too, or they do without what is wrong."""
     fmu = forged(native_path, tmp_path, pattern, text)
     lines = []
@@ -67,7 +63,7 @@ def test_a_forged_fmu_is_refused_in_a_line(
 
 
 @pytest.fixture(scope="module")
-def of_fmi3(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def of_fmi3(tmp_path_factory):
     options = twodof.FmuOptions(native=True, fmi=3)
     return twodof.build_fmu(tmp_path_factory.mktemp("forged") / "Arm3.fmu", options)
 
@@ -80,14 +76,12 @@ def of_fmi3(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ('(name="Kn"[^>]*start=")[^"]*', r"\g<1>1 2", "start value of Kn, '1 2', is no number"),
     ],
 )
-def test_a_list_of_start_values_that_is_none_is_refused(
-    of_fmi3: Path, tmp_path: Path, pattern: str, text: str, culprit: str
-) -> None:
+def test_a_list_of_start_values_that_is_none_is_refused(of_fmi3, tmp_path, pattern, text, culprit):
     with pytest.raises(twodof.TwoDofError, match=culprit):
         twodof.load_fmu(forged(of_fmi3, tmp_path, pattern, text))
 
 
-def test_a_page_of_a_frame_that_its_robot_has_not_is_refused(native_path: Path, tmp_path: Path) -> None:
+def test_a_page_of_a_frame_that_its_robot_has_not_is_refused(native_path, tmp_path):
     fmu = forged(native_path, tmp_path, 'frame="EndEffector"', 'frame="Nope"')
     with pytest.raises(PageError, match="its robot cannot be shown: it has no link 'Nope'"):
         twodof.page(fmu, tmp_path / "arm.html")

@@ -1,7 +1,5 @@
 """A run served to Foxglove, received by the client of Foxglove's own viewer."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -27,7 +25,7 @@ from twodof.errors import PublishError
 from twodof.pages.foxglove import Foxglove
 
 
-def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path: Path, tmp_path: Path) -> None:
+def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path, tmp_path):
     """The one of its viewer, in JavaScript; a gain is in the FMU within two steps."""
     client = Path(__file__).with_name("foxglove_client.js")
     node = needs("node")
@@ -71,7 +69,7 @@ def fields(value: Any) -> Any:
     return [*map(fields, parts)] if isinstance(parts, list) else parts
 
 
-def test_the_command_line_tells_where_it_listens(native_path: Path, number: int) -> None:
+def test_the_command_line_tells_where_it_listens(native_path, number):
     options = ["--foxglove", "--foxglove-port", "0", "--scene"]
     with published(number, native_path, *options) as process:
         assert process.stdout is not None
@@ -92,9 +90,7 @@ def test_the_command_line_tells_where_it_listens(native_path: Path, number: int)
         ("x_des", 1.0, "'x_des' is no gain of this FMU"),
     ],
 )
-def test_what_is_no_gain_is_ignored(
-    native_path: Path, caplog: pytest.LogCaptureFixture, name: str, value: Any, reason: str
-) -> None:
+def test_what_is_no_gain_is_ignored(native_path, caplog, name, value, reason):
     """With one warning, however often it comes."""
     viewer = Foxglove(0, set_gains=True).begin(twodof.experiment(native_path))
     asked = {"name": name} if value is None else {"name": name, "value": value}
@@ -120,7 +116,7 @@ def ask(connection: Connection, asked: dict[str, Any]) -> list[Any]:
             return [it["value"] for it in answer["parameters"]]
 
 
-def test_gains_are_set_where_asked_for_alone(native_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_gains_are_set_where_asked_for_alone(native_path, caplog):
     for set_gains, held, taken in ((False, [50.0, 50.0], {}), (True, [1.0, 1.0], {"Kp[1]": 1.0, "Kp[2]": 1.0})):
         viewer = Foxglove(0, set_gains=set_gains).begin(twodof.experiment(native_path))
         with viewer, joined(viewer.url) as connection:
@@ -130,7 +126,7 @@ def test_gains_are_set_where_asked_for_alone(native_path: Path, caplog: pytest.L
     assert "Foxglove may not set gains; `set_gains=True` allows it" in record.message
 
 
-def test_websites_but_foxgloves_own_are_refused(native_path: Path) -> None:
+def test_websites_but_foxgloves_own_are_refused(native_path):
     """By Origin, and by Host where a website's name leads to this machine."""
     with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
         url, own = viewer.url.replace("ws:", "http:"), ("Host", viewer.url.removeprefix("ws://"))
@@ -158,9 +154,7 @@ def test_websites_but_foxgloves_own_are_refused(native_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not list the owners of sockets")
 @pytest.mark.parametrize(("set_gains", "status"), [(False, b"101"), (True, b"403")])
-def test_gains_are_no_business_of_other_users(
-    native_path: Path, set_gains: bool, status: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gains_are_no_business_of_other_users(native_path, set_gains, status, monkeypatch):
     asked = ("Host", "localhost"), ("Sec-WebSocket-Protocol", "foxglove.sdk.v1"), *UPGRADE
     head = "".join(f"{name}: {value}\r\n" for name, value in asked)
     viewer = Foxglove(0, set_gains=set_gains).begin(twodof.experiment(native_path))
@@ -170,7 +164,7 @@ def test_gains_are_no_business_of_other_users(
         assert one.recv(100).split()[1] == status
 
 
-def test_a_client_of_junk_prints_nothing(native_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_client_of_junk_prints_nothing(native_path, caplog):
     with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
         address = viewer.url.removeprefix("ws://").split(":")
         for _ in range(20):
@@ -185,7 +179,7 @@ def test_a_client_of_junk_prints_nothing(native_path: Path, caplog: pytest.LogCa
     assert [record.name for record in caplog.records] == ["twodof.pages.foxglove"]
 
 
-def test_a_port_that_is_taken_is_named(native_path: Path) -> None:
+def test_a_port_that_is_taken_is_named(native_path):
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -195,7 +189,7 @@ def test_a_port_that_is_taken_is_named(native_path: Path) -> None:
             viewer.__enter__()
 
 
-def test_it_listens_on_the_loopback_interface_alone(native_path: Path) -> None:
+def test_it_listens_on_the_loopback_interface_alone(native_path):
     with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
         port = int(viewer.url.rpartition(":")[2])
         listening = Path("/proc/net/tcp").read_text().splitlines()[1:]

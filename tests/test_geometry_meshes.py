@@ -1,10 +1,7 @@
 """Meshes in colours: against the files' own XML, and as pixels of a page."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections import Counter
-from pathlib import Path
 
 import browser
 import numpy as np
@@ -29,7 +26,7 @@ DAE = "{http://www.collada.org/2005/11/COLLADASchema}"
 
 
 @pytest.mark.parametrize("name", ["link5", "hand"])
-def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) -> None:
+def test_triangles_have_the_colours_of_their_materials(robots, name):
     """Triangles of each colour are as many as the file's own lists say; the shape is coal's."""
     content = (robots / f"panda_description/meshes/visual/{name}.dae").read_bytes()
     tree = ET.fromstring(content)
@@ -87,7 +84,7 @@ f 4 1 5 8
 COLOURS = "newmtl red\nKd 0.9 0.05 0.05\nmap_Kd /etc/passwd\nnewmtl green\nKd 0.05 0.8 0.05\n"
 
 
-def test_an_obj_has_the_colours_of_its_library() -> None:
+def test_an_obj_has_the_colours_of_its_library():
     files = {"meshes/cube.obj": CUBE.encode(), "meshes/cube.obj.mtl": COLOURS.encode()}
     parts = surfaces("meshes/cube.obj", files.get, np.array([1.0, 2.0, 3.0]))
     assert {tuple(np.round(part.colour or (), 2)): len(part.triangles) for part in parts} == {
@@ -101,7 +98,7 @@ def test_an_obj_has_the_colours_of_its_library() -> None:
     assert sum(len(part.triangles) for part in plain) == 12
 
 
-def test_what_has_no_colours_or_cannot_be_read() -> None:
+def test_what_has_no_colours_or_cannot_be_read():
     triangle = b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
     files = {"a.stl": triangle + b"endloop\nendfacet\nendsolid a\n", "b.dae": b"<a", "c.obj": b"v"}
     (part,) = surfaces("a.stl", files.get, ONE)
@@ -119,7 +116,7 @@ URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/>
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_mesh_that_is_not_finite_is_not_drawn(number: float, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_mesh_that_is_not_finite_is_not_drawn(number, caplog):
     """A page whose numbers are not JSON shows nothing at all."""
     facet = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
     robot = read_urdf(URDF.replace("cube.obj", "cube.stl"))
@@ -134,7 +131,7 @@ def test_a_mesh_that_is_not_finite_is_not_drawn(number: float, caplog: pytest.Lo
 SMALL: ViewportSize = {"width": 600, "height": 280}
 
 
-def test_a_replay_shows_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_shows_them(tmp_path, monkeypatch):
     """Both colours of the cube, and not the URDF's, which is for meshes without."""
     for name, text in {"cube.urdf": URDF, "cube.obj": CUBE, "colours.mtl": COLOURS}.items():
         (tmp_path / name).write_text(text)

@@ -1,8 +1,6 @@
 """Malicious files, made by hand: a command refuses them with one clear line, or
 reads them for what they hold, in bounded time and memory."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import zipfile
@@ -36,7 +34,7 @@ ANYWHERE = ("a pipe", "3 GB of zeros")  # the others one function refuses for al
     ("what", "kind"),
     [("fmu", kind) for kind in SPECIAL] + [(what, kind) for what in ("urdf", "csv", "mesh") for kind in ANYWHERE],
 )
-def test_what_is_no_file_of_bearable_size_is_refused(what: str, kind: str, jail: Jail, native_path: Path) -> None:
+def test_what_is_no_file_of_bearable_size_is_refused(what, kind, jail, native_path):
     make, reason = SPECIAL[kind]
     path = jail.input / what
     make(path)
@@ -158,7 +156,7 @@ HOSTILE_FMUS: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
-def test_hostile_fmu_is_refused(hostile_fmu: tuple[Callable[[], bytes], str], jail: Jail) -> None:
+def test_hostile_fmu_is_refused(hostile_fmu, jail):
     make, reason = hostile_fmu
     path = jail.input / "x.fmu"
     path.write_bytes(make())
@@ -203,7 +201,7 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize(("xml", "reason"), ARRAYS.values(), ids=ARRAYS)
-def test_fmu_without_end_is_refused(xml: str, reason: str, jail: Jail) -> None:
+def test_fmu_without_end_is_refused(xml, reason, jail):
     """Arrays that no memory holds, and steps with which no run ends."""
     path = jail.input / "x.fmu"
     path.write_bytes(fmu_of(xml))
@@ -212,7 +210,7 @@ def test_fmu_without_end_is_refused(xml: str, reason: str, jail: Jail) -> None:
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_fmu_compressed_as_fmi_does_not_allow_is_refused(method: int, jail: Jail) -> None:
+def test_fmu_compressed_as_fmi_does_not_allow_is_refused(method, jail):
     content = {"modelDescription.xml": description().encode(), "binaries/linux64/m.so": b"x"}
     path = jail.input / "x.fmu"
     path.write_bytes(mutations.zip_of(content, method=method))
@@ -232,7 +230,7 @@ MODULES_THAT_ARE_NONE = {
 
 
 @pytest.mark.parametrize("name", MODULES_THAT_ARE_NONE.values(), ids=MODULES_THAT_ARE_NONE)
-def test_python_fmu_without_its_module_is_refused(name: bytes | None, jail: Jail, fmu_path: Path) -> None:
+def test_python_fmu_without_its_module_is_refused(name, jail, fmu_path):
     """pythonfmu's wrapper would crash."""
     with zipfile.ZipFile(fmu_path) as archive:
         members = {member: archive.read(member) for member in archive.namelist()}
@@ -244,13 +242,13 @@ def test_python_fmu_without_its_module_is_refused(name: bytes | None, jail: Jail
     refused(jail, "slavemodule.txt does not name", "run", path, "-o", jail.target / "bag")
 
 
-def test_fmu_of_any_name_is_read(jail: Jail, native_path: Path) -> None:
+def test_fmu_of_any_name_is_read(jail, native_path):
     """FMPy takes a file for a model description where its name says so."""
     shutil.copyfile(native_path, jail.input / "x.xml")
     assert jail.run("info", jail.input / "x.xml").status == 0
 
 
-def test_fmu_that_cannot_be_loaded_leaves_the_working_directory(tmp_path: Path) -> None:
+def test_fmu_that_cannot_be_loaded_leaves_the_working_directory(tmp_path):
     (tmp_path / "x.fmu").write_bytes(fmu_of(description()))
     before = Path.cwd()
     with pytest.raises(FmuError, match="cannot be loaded"):
@@ -323,7 +321,7 @@ HOSTILE_URDFS: dict[str, tuple[Callable[[], str], str]] = {
 }
 
 
-def test_hostile_urdf_is_refused(hostile_urdf: tuple[Callable[[], str], str], jail: Jail) -> None:
+def test_hostile_urdf_is_refused(hostile_urdf, jail):
     make, reason = hostile_urdf
     refused(jail, reason, *build_command(jail, make()))
 
@@ -346,7 +344,7 @@ LARGE_URDFS: dict[str, Callable[[], str]] = {
 }
 
 
-def test_large_urdf_is_built_or_refused(large_urdf: Callable[[], str], jail: Jail) -> None:
+def test_large_urdf_is_built_or_refused(large_urdf, jail):
     jail.run(*build_command(jail, large_urdf()))
 
 
@@ -363,7 +361,7 @@ HOSTILE_CSVS: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
-def test_hostile_csv_is_refused(hostile_csv: tuple[Callable[[], bytes], str], jail: Jail, native_path: Path) -> None:
+def test_hostile_csv_is_refused(hostile_csv, jail, native_path):
     make, reason = hostile_csv
     path = jail.input / "x.csv"
     path.write_bytes(make())

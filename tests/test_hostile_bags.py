@@ -4,8 +4,6 @@ MCAP files are made record by record after the specification. What is refused fo
 tested in test_records.py.
 """
 
-from __future__ import annotations
-
 import shutil
 import struct
 from collections.abc import Callable
@@ -17,7 +15,7 @@ import numpy as np
 import pytest
 import zstandard
 from bags import CHANNEL, FOOTER, HEADER, SCHEMA, channel, chunk, joint_message, message, record, sample, serialised
-from jail import MIB, SPECIAL, Jail, check_reading, without_slow
+from jail import MIB, SPECIAL, check_reading, without_slow
 from jail import jail as jail
 from jail import the_jail as the_jail
 
@@ -31,7 +29,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture(scope="module")
-def bags(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> Path:
+def bags(tmp_path_factory, native_path):
     """A folder with a good bag in each storage."""
     folder = tmp_path_factory.mktemp("bags")
     run = twodof.experiment(native_path)
@@ -186,7 +184,7 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
 }
 
 
-def test_hostile_bag(hostile_bag: Callable[[Path], None], jail: Jail, bags: Path) -> None:
+def test_hostile_bag(hostile_bag, jail, bags):
     bag = jail.target / "bag"
     shutil.copytree(bags / "mcap/bag", bag)
     shutil.copyfile(bags / "sqlite3/bag/bag.db3", jail.input / "good.db3")

@@ -1,7 +1,5 @@
 """The icon of an FMU shows its robot."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path
@@ -41,7 +39,7 @@ def direction(points: Points) -> float:
 
 
 @pytest.mark.parametrize("q", [(0.5, 0.35), (0.2, 0.9), (1.2, -1.9)])
-def test_the_icon_is_of_the_robot_at_its_start(tmp_path: Path, q: tuple[float, float]) -> None:
+def test_the_icon_is_of_the_robot_at_its_start(tmp_path, q):
     """Two links of one length at q1 and q1 + q2, and a disc at each joint."""
     fmu = build_fmu(tmp_path / "Arm.fmu", FmuOptions(q_start=q))
     link, last, discs = points_of(fmu)
@@ -53,7 +51,7 @@ def test_the_icon_is_of_the_robot_at_its_start(tmp_path: Path, q: tuple[float, f
     assert np.linalg.norm(last - tip, axis=1).min() < 3.0 < np.linalg.norm(link - tip, axis=1).min()
 
 
-def test_a_robot_without_extent_has_an_icon(tmp_path: Path) -> None:
+def test_a_robot_without_extent_has_an_icon(tmp_path):
     (tmp_path / "slider.urdf").write_text(SLIDER)
     link, last, discs = points_of(build_fmu(tmp_path / "Slider.fmu", FmuOptions(urdf=tmp_path / "slider.urdf")))
     assert not link.size and not last.size and discs.mean(axis=0) == pytest.approx([149.5, -99.5])

@@ -1,8 +1,5 @@
 """Settings of a run: constants and inputs over time, and their effect."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +9,12 @@ import twodof
 from twodof.cli.options import parse_settings
 from twodof.errors import InputError
 from twodof.fmu import Fmu
-from twodof.simulation.input_values import Setting, read_changes, resolve
+from twodof.simulation.input_values import read_changes, resolve
 from twodof.simulation.sample import Sample
 
 
 @pytest.fixture(scope="module")
-def fmu(native_path: Path) -> Fmu:
+def fmu(native_path):
     return twodof.load_fmu(native_path)
 
 
@@ -38,7 +35,7 @@ PARSED = {
 
 
 @pytest.mark.parametrize(("texts", "settings"), PARSED.values(), ids=PARSED)
-def test_setting_is_parsed(texts: list[str], settings: dict[str, Setting]) -> None:
+def test_setting_is_parsed(texts, settings):
     parsed = parse_settings(texts)
     assert parsed == settings
     assert [type(value) for value in parsed.values()] == [type(v) for v in settings.values()]
@@ -57,7 +54,7 @@ UNPARSED = {
 
 
 @pytest.mark.parametrize(("texts", "culprit"), UNPARSED.values(), ids=UNPARSED)
-def test_setting_that_cannot_be_parsed_is_refused(texts: list[str], culprit: str) -> None:
+def test_setting_that_cannot_be_parsed_is_refused(texts, culprit):
     with pytest.raises(InputError, match=f"--set {culprit}"):
         parse_settings(texts)
 
@@ -82,9 +79,7 @@ RESOLVED = {
 
 
 @pytest.mark.parametrize(("settings", "values"), RESOLVED.values(), ids=RESOLVED)
-def test_setting_gives_values_of_variables(
-    fmu: Fmu, settings: dict[str, Setting], values: dict[str, float | bool]
-) -> None:
+def test_setting_gives_values_of_variables(fmu, settings, values):
     resolved = resolve(fmu, settings)
     assert resolved == values
     assert {type(value) for value in resolved.values()} <= {float, bool}
@@ -116,13 +111,13 @@ UNRESOLVED = {
 
 
 @pytest.mark.parametrize(("settings", "culprit"), UNRESOLVED.values(), ids=UNRESOLVED)
-def test_setting_that_does_not_fit_the_fmu_is_refused(fmu: Fmu, settings: dict[str, Setting], culprit: str) -> None:
+def test_setting_that_does_not_fit_the_fmu_is_refused(fmu, settings, culprit):
     with pytest.raises(InputError, match=culprit):
         resolve(fmu, settings)
 
 
 @pytest.mark.parametrize("unknown", ["tau[3]", "q1", "v[9]"])
-def test_what_is_suggested_can_be_set(fmu: Fmu, unknown: str) -> None:
+def test_what_is_suggested_can_be_set(fmu, unknown):
     with pytest.raises(InputError, match=r"did you mean|there are") as refusal:
         resolve(fmu, {unknown: 1.0})
     _, _, suggested = str(refusal.value).partition("did you mean '")
@@ -148,7 +143,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize(("text", "changes"), TABLES.values(), ids=TABLES)
-def test_table_is_read(fmu: Fmu, tmp_path: Path, text: str, changes: list[tuple[float, dict[str, float]]]) -> None:
+def test_table_is_read(fmu, tmp_path, text, changes):
     (tmp_path / "inputs.csv").write_text(text, "utf-8", newline="")
     assert read_changes(fmu, tmp_path / "inputs.csv") == changes
 
@@ -177,7 +172,7 @@ BAD_TABLES = {
 
 
 @pytest.mark.parametrize(("text", "culprit"), BAD_TABLES.values(), ids=BAD_TABLES)
-def test_refused_table_is_named_with_its_culprit(fmu: Fmu, tmp_path: Path, text: str, culprit: str) -> None:
+def test_refused_table_is_named_with_its_culprit(fmu, tmp_path, text, culprit):
     path = tmp_path / "inputs.csv"
     path.write_text(text, "utf-8")
     with pytest.raises(InputError, match=culprit) as refusal:
@@ -186,22 +181,20 @@ def test_refused_table_is_named_with_its_culprit(fmu: Fmu, tmp_path: Path, text:
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"PK\x03\x04\xc0\x00\x80"])
-def test_table_that_is_not_text_is_refused(fmu: Fmu, tmp_path: Path, content: bytes) -> None:
+def test_table_that_is_not_text_is_refused(fmu, tmp_path, content):
     (tmp_path / "inputs.csv").write_bytes(content)
     with pytest.raises(InputError, match=r"inputs\.csv' is not UTF-8 text; save it as CSV UTF-8"):
         read_changes(fmu, tmp_path / "inputs.csv")
 
 
 @pytest.mark.parametrize(("name", "reason"), [("none.csv", ""), ("", "Is a directory")])
-def test_table_that_is_no_file_is_refused(fmu: Fmu, tmp_path: Path, name: str, reason: str) -> None:
+def test_table_that_is_no_file_is_refused(fmu, tmp_path, name, reason):
     with pytest.raises(InputError, match=f"'{tmp_path / name}.*{reason}"):
         read_changes(fmu, tmp_path / name)
 
 
 @pytest.mark.parametrize("settings", [{"x_des": 0.2}, {"x_des[1]": 0.2}])
-def test_variable_that_is_both_set_and_in_the_table_is_refused(
-    fmu: Fmu, tmp_path: Path, settings: dict[str, Setting]
-) -> None:
+def test_variable_that_is_both_set_and_in_the_table_is_refused(fmu, tmp_path, settings):
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0,0.1\n")
     with pytest.raises(InputError, match=r"x_des\[1\] is both set and in '.*inputs\.csv'"):
         twodof.experiment(fmu, settings=settings, input_file=tmp_path / "inputs.csv", stamp_start=0)
@@ -224,7 +217,7 @@ N = 12
 
 
 @pytest.fixture
-def table(tmp_path: Path) -> Path:
+def table(tmp_path):
     lines = [f"{t},{row['x_des[1]']},{row['Kp[2]']}" for t, row in ROWS]
     path = tmp_path / "inputs.csv"
     path.write_text("\n".join(["time,x_des[1],Kp[2]", *lines]))
@@ -240,7 +233,7 @@ def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: Any) -> list
     return found
 
 
-def test_run_with_a_table_is_the_run_with_its_rows_set_by_hand(fmu: Fmu, table: Path) -> None:
+def test_run_with_a_table_is_the_run_with_its_rows_set_by_hand(fmu, table):
     run = twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0)
     seen = [(sample, dict(sample.inputs)) for sample in run]
     assert all(sample.inputs == inputs for sample, inputs in seen)  # later ones change no earlier
@@ -249,13 +242,13 @@ def test_run_with_a_table_is_the_run_with_its_rows_set_by_hand(fmu: Fmu, table: 
     assert len({sample.q for sample in from_table}) == N + 1
 
 
-def test_start_values_hold_before_the_first_row(fmu: Fmu, tmp_path: Path) -> None:
+def test_start_values_hold_before_the_first_row(fmu, tmp_path):
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0.05,0.1\n")
     run = twodof.samples(fmu, stop_time=N * STEP, input_file=tmp_path / "inputs.csv", stamp_start=0)
     assert [sample.inputs["x_des[1]"] for sample in run] == [0.2] * 6 + [0.1] * (N - 5)
 
 
-def test_rows_before_the_start_hold_at_the_start(fmu: Fmu, tmp_path: Path) -> None:
+def test_rows_before_the_start_hold_at_the_start(fmu, tmp_path):
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n-2,0.3\n-1,0.1\n")
     run = twodof.samples(fmu, stop_time=STEP, input_file=tmp_path / "inputs.csv", stamp_start=0)
     plain = twodof.samples(fmu, stop_time=STEP, settings={"x_des[1]": 0.1}, stamp_start=0)
@@ -263,9 +256,7 @@ def test_rows_before_the_start_hold_at_the_start(fmu: Fmu, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("end", "late"), [(0.05, 3), (0.06, 0)])
-def test_rows_after_the_end_are_told(
-    fmu: Fmu, tmp_path: Path, caplog: pytest.LogCaptureFixture, end: float, late: int
-) -> None:
+def test_rows_after_the_end_are_told(fmu, tmp_path, caplog, end, late):
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0.06,0.3\n0.06,0.1\n0.06,0.1\n")
     twodof.experiment(fmu, stop_time=end, input_file=tmp_path / "inputs.csv", stamp_start=0)
     twodof.experiment(fmu, stop_time=end, changes=[(0.06, {"x_des": 0.1})], stamp_start=0)
@@ -274,12 +265,12 @@ def test_rows_after_the_end_are_told(
     assert all("are never set" in line for line in caplog.messages)
 
 
-def test_a_parameter_cannot_be_sent(fmu: Fmu) -> None:
+def test_a_parameter_cannot_be_sent(fmu):
     with pytest.raises(twodof.TwoDofError, match="rtol"):
         by_hand(fmu, {2: {"rtol": 1e-4}})
 
 
-def test_a_setting_holds_throughout(fmu: Fmu) -> None:
+def test_a_setting_holds_throughout(fmu):
     run = twodof.samples(fmu, stop_time=N * STEP, settings={"Kp": 80, "q_start": (0.4, 0.6)}, stamp_start=0)
     found = list(run)
     assert found[0].q == (0.4, 0.6)
@@ -303,15 +294,13 @@ TIMES = {
 
 
 @pytest.mark.parametrize(("times", "culprit"), TIMES.values(), ids=TIMES)
-def test_times_that_make_no_run_are_refused(fmu: Fmu, times: dict[str, Any], culprit: str) -> None:
+def test_times_that_make_no_run_are_refused(fmu, times, culprit):
     with pytest.raises(InputError, match=culprit):
         twodof.experiment(fmu, **times)
 
 
 @pytest.mark.parametrize(("stop", "step", "n"), [(5.0, 0.01, 500), (0.3, 0.1, 3), (1e4, 1e-3, 10**7)])
-def test_number_of_steps_is_right_though_the_step_has_no_binary_form(
-    fmu: Fmu, stop: float, step: float, n: int
-) -> None:
+def test_number_of_steps_is_right_though_the_step_has_no_binary_form(fmu, stop, step, n):
     run = twodof.experiment(fmu, stop_time=stop, step=step)
     assert (run.steps, run.time(n)) == (n, n * step)
 
@@ -319,7 +308,7 @@ def test_number_of_steps_is_right_though_the_step_has_no_binary_form(
 # --- changes over time, given in Python ---
 
 
-def test_changes_are_named_as_settings_are(fmu: Fmu) -> None:
+def test_changes_are_named_as_settings_are(fmu):
     run = twodof.experiment(fmu, changes=[(0.1, {"x_des": (0.1, 0.2)}), (0.1, {"Kp": 9})])
     assert run.changes == [(0.1, {"x_des[1]": 0.1, "x_des[2]": 0.2}), (0.1, {"Kp[1]": 9.0, "Kp[2]": 9.0})]
 
@@ -335,11 +324,11 @@ def test_changes_are_named_as_settings_are(fmu: Fmu) -> None:
         ([(float("nan"), {"Kp": 1.0})], "the times of `changes` must be finite and ascend"),
     ],
 )
-def test_changes_that_cannot_be_are_refused_before_the_run(fmu: Fmu, changes, culprit) -> None:
+def test_changes_that_cannot_be_are_refused_before_the_run(fmu, changes, culprit):
     with pytest.raises(InputError, match=culprit):
         twodof.experiment(fmu, changes=changes)
 
 
-def test_an_element_beyond_a_vectors_end_is_told_as_such(fmu: Fmu) -> None:
+def test_an_element_beyond_a_vectors_end_is_told_as_such(fmu):
     with pytest.raises(InputError, match=r"no variable 'Kp\[3\]': Kp has 2 elements"):
         twodof.experiment(fmu, settings={"Kp[3]": 1.0})

@@ -1,7 +1,5 @@
 """Robots by name: of example-robot-data and of robot_descriptions' cache, with their end effector and home pose."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +16,7 @@ from twodof.export.stock_robots import stock_robots
     ("name", "srdf", "pose", "frame"),
     [("panda", "panda", "default", "panda_hand_tcp"), ("z1", "z1", "home", ""), ("ur5_robot", "", "", "tool0")],
 )
-def test_a_robot_has_its_home_pose_as_pinocchio_reads_it(
-    name: str, srdf: str, pose: str, frame: str, tmp_path: Path
-) -> None:
+def test_a_robot_has_its_home_pose_as_pinocchio_reads_it(name, srdf, pose, frame, tmp_path):
     path = stock_robots()[name]
     model = pin.buildModelFromUrdf(str(path), mimic=True)
     q = pin.neutral(model)
@@ -34,16 +30,14 @@ def test_a_robot_has_its_home_pose_as_pinocchio_reads_it(
         assert start == pytest.approx(q[model.joints[model.getJointId(joint)].idx_q], abs=1e-12), joint
 
 
-def test_a_panda_by_name_has_its_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_panda_by_name_has_its_meshes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["build", "--robot", "panda"]) == 0
     fmu = twodof.load_fmu("panda.fmu")
     assert len([name for name in fmu.members if name.endswith(".dae")]) == 10
 
 
-def test_a_panda_with_fixed_fingers_has_the_home_pose_of_its_arm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_panda_with_fixed_fingers_has_the_home_pose_of_its_arm(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["build", "--robot", "panda", "--lock", "*finger*", "--no-meshes", "-o", "fixed.fmu"]) == 0
     free, fixed = (
@@ -57,9 +51,7 @@ def test_a_panda_with_fixed_fingers_has_the_home_pose_of_its_arm(
         ]
 
 
-def test_the_cache_of_robot_descriptions_is_listed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_cache_of_robot_descriptions_is_listed(tmp_path, monkeypatch, capsys):
     for package in ("left", "right"):
         (tmp_path / package / "urdf").mkdir(parents=True)
         shutil.copy(Path(__file__).parents[1] / "urdf/2dof.urdf", tmp_path / package / "urdf/arm.urdf")
@@ -72,16 +64,14 @@ def test_the_cache_of_robot_descriptions_is_listed(
     assert twodof.stock_robot("single").frame == "EndEffector"
 
 
-def test_a_list_without_robots_says_how_to_have_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_list_without_robots_says_how_to_have_them(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path))
     monkeypatch.setattr("twodof.export.stock_robots.PACKAGE", "no-such-package")
     assert main(["build", "--list-robots"]) == 1
     assert "there are no installed robots; pip install example-robot-data" in capsys.readouterr().err
 
 
-def test_a_robot_that_is_unknown_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_that_is_unknown_is_refused(capsys):
     assert main(["build", "--robot", "pandda"]) == 1
     assert "there is no robot 'pandda'; did you mean 'panda'?" in capsys.readouterr().err
     with pytest.raises(twodof.TwoDofError, match="no robot 'ur5'; did you mean 'ur5_robot'"):

@@ -4,8 +4,6 @@ The tools themselves are not here: their files are read by parsers of YAML, XML 
 topic and field in them is looked for in a bag.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -23,7 +21,7 @@ QOS = {"Reliability Policy": "reliability", "Durability Policy": "durability"}
 
 
 @pytest.fixture(scope="module", params=["task", "pose", "joint", "effort"])
-def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag(request, tmp_path_factory):
     """Return a bag with everything that a layout shows."""
     folder = tmp_path_factory.mktemp("layouts")
     fmu = folder / "Arm 1.fmu"
@@ -39,7 +37,7 @@ def dictionaries(tree: Any) -> list[dict[str, Any]]:
     return [tree] * isinstance(tree, dict) + [d for part in parts for d in dictionaries(part)]
 
 
-def test_rviz_shows_the_topics_of_the_bag_as_they_are_offered(bag: Path) -> None:
+def test_rviz_shows_the_topics_of_the_bag_as_they_are_offered(bag):
     config = YAML(typ="safe").load(bag.parent / "Arm 1.rviz")
     manager = config["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] == "world"
@@ -60,7 +58,7 @@ def test_rviz_shows_the_topics_of_the_bag_as_they_are_offered(bag: Path) -> None
     assert ("/target" in shown) == ("/target" in topics)
 
 
-def test_plotjuggler_draws_each_field_of_each_joint(bag: Path) -> None:
+def test_plotjuggler_draws_each_field_of_each_joint(bag):
     """Under the names that it gives to a JointState's fields: topic, joint, field."""
     root = ET.parse(bag.parent / "Arm 1.plotjuggler.xml").getroot()
     curves = {curve.get("name") for curve in root.iter("curve")}
@@ -69,7 +67,7 @@ def test_plotjuggler_draws_each_field_of_each_joint(bag: Path) -> None:
     assert curves == {f"/joint_states/{name}/{field}" for name in names for field in fields}
 
 
-def test_foxglove_draws_what_messages_hold(bag: Path) -> None:
+def test_foxglove_draws_what_messages_hold(bag):
     layout = json.loads((bag.parent / "Arm 1.foxglove.json").read_text("utf-8"))
     panels, messages = layout["configById"], recorded(bag)
     fields = {"position": 2, "velocity": 3, "effort": 4}
@@ -94,9 +92,7 @@ def test_foxglove_draws_what_messages_hold(bag: Path) -> None:
     assert ("Parameters!gains" in panels) == bool(gains)
 
 
-def test_names_are_text_and_topics_are_in_the_namespace(
-    native_path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_names_are_text_and_topics_are_in_the_namespace(native_path, tmp_path, capfd):
     urdf = (Path(__file__).parents[1] / "urdf" / "2dof.urdf").read_text("utf-8")
     (tmp_path / "odd.urdf").write_text(urdf.replace("joint1", "a&quot;&lt;b>"), "utf-8")
     fmu = twodof.build_fmu(tmp_path / "Odd.fmu", twodof.FmuOptions(urdf=tmp_path / "odd.urdf", meshes=False))
@@ -117,7 +113,7 @@ def test_names_are_text_and_topics_are_in_the_namespace(
     assert len([*(tmp_path / "none" / "yet").iterdir()]) == 3
 
 
-def test_layouts_that_were_changed_stay(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_layouts_that_were_changed_stay(bag, tmp_path, capsys):
     command = ["layouts", str(bag.parent / "Arm 1.fmu"), "-o", str(tmp_path)]
     assert main(command) == main(command) == 0
     rviz, juggler = tmp_path / "Arm 1.rviz", tmp_path / "Arm 1.plotjuggler.xml"

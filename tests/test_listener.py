@@ -3,8 +3,6 @@
 Truth is the loop closed in Python by the same equation, and the bag read by the MCAP project.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import re
@@ -46,7 +44,7 @@ def control(n: int) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def bare(tmp_path_factory: pytest.TempPathFactory, panda: str) -> Callable[[int], Path]:
+def bare(tmp_path_factory, panda):
     """The bare plant of the default arm (2 joints) and of the Panda (7)."""
     folder = tmp_path_factory.mktemp("bare")
 
@@ -62,7 +60,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory, panda: str) -> Callable[[int]
 
 
 @pytest.fixture(scope="module")
-def jointed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def jointed(tmp_path_factory):
     """The default arm under joint control."""
     path = tmp_path_factory.mktemp("joint") / "Joint.fmu"
     return twodof.build_fmu(path, twodof.FmuOptions(control="joint", native=True))
@@ -88,9 +86,7 @@ def closed(fmu: Path, n: int, steps: int, delay: Callable[[int], int]) -> Iterat
         sample = run.send({"tau_cmd": past[at]} if at >= 0 else None)
 
 
-def test_lockstep_is_the_loop_closed_in_python_bit_for_bit(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
-) -> None:
+def test_lockstep_is_the_loop_closed_in_python_bit_for_bit(bare, tmp_path, number, listen, length):
     fmu, steps = bare(7), length(6000, 1000)
     node = listen(*control(7))
     bag = tmp_path / "bag"
@@ -107,9 +103,7 @@ def test_lockstep_is_the_loop_closed_in_python_bit_for_bit(
     assert node.told[-1] == ["controlled", steps + 1] or node.told[-1][1] > steps  # first repeated
 
 
-def test_lockstep_gives_the_same_bytes_each_time(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
-) -> None:
+def test_lockstep_gives_the_same_bytes_each_time(bare, tmp_path, number, listen, length):
     fmu, contents = bare(2), []
     options = ["--lockstep", "--stamp-start", "1000", "--stop-time", "2", "--scene"]
     bag = tmp_path / "bag"
@@ -126,9 +120,7 @@ def test_lockstep_gives_the_same_bytes_each_time(
     assert len(contents[0][0]["input_changes"]) > 160
 
 
-def test_a_controller_in_real_time_misses_nothing(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
-) -> None:
+def test_a_controller_in_real_time_misses_nothing(bare, tmp_path, number, listen, length):
     """Each step has the answer to a sample of just before; with those delays, the same bits."""
     fmu, steps = bare(7), 100 * length(60, 4)
     node = listen("/joint_states", *control(7))
@@ -176,15 +168,7 @@ def test_a_controller_in_real_time_misses_nothing(
         ),
     ],
 )
-def test_lockstep_says_who_is_missing(
-    bare: Callable[[int], Path],
-    tmp_path: Path,
-    number: int,
-    listen: Listen,
-    topics: tuple[str, ...],
-    command: str,
-    missing: str,
-) -> None:
+def test_lockstep_says_who_is_missing(bare, tmp_path, number, listen, topics, command, missing):
     node = listen(*topics) if topics else None
 
     def opened(publisher: twodof.Publisher) -> None:
@@ -206,9 +190,7 @@ def test_lockstep_says_who_is_missing(
     assert len(recorded(tmp_path / "bag")["/joint_states"]) == 1
 
 
-def test_a_controller_that_stalls_dies_and_returns(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
-) -> None:
+def test_a_controller_that_stalls_dies_and_returns(bare, tmp_path, number, listen):
     bag = tmp_path / "bag"
     with published(number, bare(2), "--effort", "-o", str(bag)) as process:
         watch = listen("/joint_states")
@@ -237,9 +219,7 @@ def test_a_controller_that_stalls_dies_and_returns(
         np.testing.assert_allclose(np.diff(tau[k - 40 : k + 1], n=2, axis=0), 0.0, atol=1e-9)
 
 
-def test_commands_that_mean_nothing_or_are_absurd_end_no_run(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
-) -> None:
+def test_commands_that_mean_nothing_or_are_absurd_end_no_run(bare, tmp_path, number, listen):
     """The former have one warning a kind; a step with the latter is refused."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")
@@ -284,7 +264,7 @@ def test_commands_that_mean_nothing_or_are_absurd_end_no_run(
         assert line.startswith(text)
 
 
-def test_a_flood_of_commands_holds_nothing_up(jointed: Path, tmp_path: Path, number: int, listen: Listen) -> None:
+def test_a_flood_of_commands_holds_nothing_up(jointed, tmp_path, number, listen):
     """Some 10,000 a second; the newest wins."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")
@@ -302,7 +282,7 @@ def test_a_flood_of_commands_holds_nothing_up(jointed: Path, tmp_path: Path, num
     assert targets == [(0.2, 0.1), (0.4, 0.3)]
 
 
-def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
+def test_names_of_topics(jointed, number, listen):
     """A namespace is of names that do not begin with a slash."""
     options = ["--namespace", "left", "--state-topic", "/robot_joint_states", "--scene", "--clock"]
     node = listen("/robot_joint_states=state", "/clock=clock", "/left/arm/command=command")
@@ -321,9 +301,7 @@ def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
     }
 
 
-def test_several_robots_are_in_step_and_apart(
-    bare: Callable[[int], Path], jointed: Path, tmp_path: Path, number: int, listen: Listen
-) -> None:
+def test_several_robots_are_in_step_and_apart(bare, jointed, tmp_path, number, listen):
     """One clock and its stamps for all, each at its time; who commands one moves one."""
     robots = [f"left={jointed}", f"right={jointed}", str(bare(2))]
     names = ("left", "right", "Bare2")
@@ -354,7 +332,7 @@ def test_several_robots_are_in_step_and_apart(
 
 
 @pytest.mark.parametrize("speed", [0.1, 10.0])
-def test_the_clock_is_that_of_the_simulation(native_path: Path, number: int, listen: Listen, speed: float) -> None:
+def test_the_clock_is_that_of_the_simulation(native_path, number, listen, speed):
     node = listen("/clock=clock", "/joint_states")
     end = 4 * speed
     options = ["--clock", "--speed", str(speed), "--stamp-start", "100"]
@@ -371,7 +349,7 @@ def test_the_clock_is_that_of_the_simulation(native_path: Path, number: int, lis
     assert np.median(simulated / wall) == pytest.approx(speed, rel=0.1)
 
 
-def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
+def test_pause_and_step(native_path, number, listen):
     node = listen("/clock=clock", "/pause=bool", "/step=uint")
 
     def clock() -> list[int]:
@@ -424,15 +402,13 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
         (["--on-timeout", "hold", "--lockstep"], "--on-timeout applies to joint commands without --lockstep"),
     ],
 )
-def test_options_that_cannot_be(
-    jointed: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
-) -> None:
+def test_options_that_cannot_be(jointed, capfd, options, culprit):
     usage = options[0] in ("--rate", "--overwrite")
     assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == (2 if usage else 1)
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"twodof: error: {culprit}"), line
 
 
-def test_a_timeout_of_nothing(native_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_timeout_of_nothing(native_path, capfd):
     assert main(["publish", str(native_path), "--stop-time", "0.1", "--timeout", "1"]) == 1
     assert "--timeout applies to joint commands and to --lockstep only" in capfd.readouterr().err

@@ -1,14 +1,12 @@
 """A live arm, controlled and seen in a browser, against the closed form and other readers of bags."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal
 import socket
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -40,7 +38,7 @@ from browser import (
     until,
 )
 from harness import wait_until
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Page
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
 
@@ -52,30 +50,30 @@ ROUNDED = 6e-5  # m or rad, of what the page says
 
 
 @pytest.fixture(scope="module")
-def shown() -> Iterator[Browser]:
+def shown():
     with chromium() as program:
         yield program
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("live")
 
 
 @pytest.fixture(scope="module")
-def command(folder: Path, native_path: Path) -> Iterator[Served]:
+def command(folder, native_path):
     with served("live", native_path, "-o", "recorded", cwd=folder) as command:
         yield command
 
 
 @pytest.fixture(scope="module")
-def arm(shown: Browser, command: Served) -> Iterator[Page]:
+def arm(shown, command):
     with opened(shown, command.url) as page:
         yield page
 
 
 @pytest.fixture
-def page(arm: Page) -> Page:
+def page(arm):
     """A page whose arm is at its start, paused, with the inputs of the FMU, and seen as at first."""
     if arm.evaluate("arm.playing"):
         pause(arm)
@@ -144,7 +142,7 @@ def assert_follows(
     assert x == pytest.approx(oracles.position(q), abs=2 * ROUNDED)
 
 
-def test_target_is_dragged_and_followed_as_the_closed_form_says(command: Served, page: Page) -> None:
+def test_target_is_dragged_and_followed_as_the_closed_form_says(command, page):
     """Under gains of the sliders; time is kept, and the curves' samples are what is shown."""
     noted = page.evaluate("arm.noted")
     latest(command, lambda news: news["noted"] == noted + 1, ["change", {browser.HOSTILE: 0}])
@@ -191,7 +189,7 @@ def test_target_is_dragged_and_followed_as_the_closed_form_says(command: Served,
     pause(page)
 
 
-def test_two_viewers_see_and_steer_the_same(command: Served, page: Page) -> None:
+def test_two_viewers_see_and_steer_the_same(command, page):
     """The other is a websocket."""
     with open_socket(socket_of(command)) as other:
 
@@ -215,7 +213,7 @@ def test_two_viewers_see_and_steer_the_same(command: Served, page: Page) -> None
     assert page.title() == "2dof - twodof"
 
 
-def test_a_parameter_begins_the_run_anew(page: Page) -> None:
+def test_a_parameter_begins_the_run_anew(page):
     press(page, "Step")
     until(page, lambda found: found["time"] == "0.010 s")
     type_into(page, "payload, kg", 0.5)
@@ -234,7 +232,7 @@ def test_a_parameter_begins_the_run_anew(page: Page) -> None:
 ORDERS = (["no order"], ["[]"], ['["leave", 1]'], ['["change", 3]'], ['["change"]'], ["{}"], [b"\xff"], ["x" * 100_000])
 
 
-def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> None:
+def test_who_gives_no_orders_is_not_listened_to(command, page):
     for orders in ORDERS:
         with open_socket(socket_of(command)) as connection:
             for order in orders:
@@ -246,7 +244,7 @@ def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> 
     until(page, lambda found: found["time"] == "0.010 s")
 
 
-def test_a_flood_of_orders_stops_no_news(command: Served, page: Page) -> None:
+def test_a_flood_of_orders_stops_no_news(command, page):
     """Nor another page's orders, and its own last one is followed."""
     with open_socket(socket_of(command)) as flood, open_socket(socket_of(command)) as other:
         other.send('["play", true]')
@@ -283,7 +281,7 @@ def test_a_flood_of_orders_stops_no_news(command: Served, page: Page) -> None:
             pass
 
 
-def test_a_setting_that_is_none_is_told_as_text(command: Served, page: Page) -> None:
+def test_a_setting_that_is_none_is_told_as_text(command, page):
     def ask(name: str, value: object, number: int) -> None:
         latest(command, lambda news: news["noted"] == number, ["change", {name: value}])
         until(page, lambda said: name.split("[")[0][:50] in said, told)
@@ -296,7 +294,7 @@ def test_a_setting_that_is_none_is_told_as_text(command: Served, page: Page) -> 
     until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
 
 
-def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown: Browser, fmu_path: Path, tmp_path: Path) -> None:
+def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown, fmu_path, tmp_path):
     """In the Python flavour; what is beyond the page's own pace is not waited for."""
     with served("live", fmu_path, cwd=tmp_path) as command:
         place = urlsplit(socket_of(command))
@@ -312,7 +310,7 @@ def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown: Browser, fm
         deaf.close()
 
 
-def test_closing_the_last_page_pauses(native_path: Path, tmp_path: Path) -> None:
+def test_closing_the_last_page_pauses(native_path, tmp_path):
     """And another signal ends as Ctrl-C does."""
     with served("live", native_path, cwd=tmp_path) as command:
 
@@ -352,7 +350,7 @@ def socket_of(command: Served) -> str:
     return browser.socket_of(command.url)
 
 
-def test_who_has_no_token_is_refused(command: Served) -> None:
+def test_who_has_no_token_is_refused(command):
     """Another user of this machine, to whom the port is open."""
     token = urlsplit(command.url).query.removeprefix("token=")
     assert len(token) == 43
@@ -362,7 +360,7 @@ def test_who_has_no_token_is_refused(command: Served) -> None:
             assert browser.answer(command.url, *own, path=path + query) == 403
 
 
-def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
+def test_the_socket_is_guarded_as_the_page(command):
     for headers, status in (
         ((("Host", "localhost"), ("Origin", "http://localhost")), 101),
         ((("Host", "localhost"), ("Origin", "http://evil.example")), 403),
@@ -375,7 +373,7 @@ def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
         assert browser.answer(command.url, *headers, path=f"/?{query}") == page
 
 
-def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> None:
+def test_the_page_talks_to_its_server_alone(shown, command):
     """By its policy: nothing else that it would ask for is asked for."""
     with socket.create_server(("127.0.0.1", 0)) as other, shown.new_context() as context:
         context.set_default_timeout(1e3 * browser.TIMEOUT)
@@ -396,7 +394,7 @@ def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> 
             other.accept()
 
 
-def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path) -> None:
+def test_recording_is_what_was_shown(page, folder, native_path):
     type_into(page, "x_des[1], m", 0.2)
     type_into(page, "x_des[2], m", 0.05)
     press(page, "Play")
@@ -461,7 +459,7 @@ SLIDER = """<robot name="slider">
 </robot>"""
 
 
-def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:
+def test_twenty_reconnects_leak_nothing(command, page):
     for i in range(20):
         connect(command.url)
         if i == 4:
@@ -475,7 +473,7 @@ def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:
     watch(page, left + 0.3)  # one that leaves is not the last
 
 
-def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_path: Path) -> None:
+def test_seven_joints_without_a_mesh_to_a_pose(shown, panda, tmp_path):
     """In the Python flavour; a target orientation of zeros is refused and ends nothing."""
     tree = ET.fromstring(panda)
     for link in tree.findall("link"):
@@ -508,9 +506,7 @@ def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_p
         assert len(pixels(picture(page), LINKS[0])) > 200  # a joint's ball, as dark as link 1
 
 
-def test_a_page_whose_server_ends_goes_on_with_the_next(
-    shown: Browser, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_whose_server_ends_goes_on_with_the_next(shown, native_path, tmp_path, monkeypatch):
     """The next server steps another robot, whose joints have units of their own.
 
     At rest J⁻ᵀ τ_ext is balanced by Kp: M (J⁻¹ Kp e) = τ_ext, with the textbook's M.

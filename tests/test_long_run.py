@@ -1,10 +1,7 @@
 """A simulated day: flat memory, stamps without drift, a bag that opens."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +30,7 @@ print(memory.growth, summary.wall_time)
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @both_storages
-def test_a_day_has_flat_memory_and_exact_stamps(
-    native_path: Path, tmp_path: Path, storage: str, length: Callable[[int, int], int]
-) -> None:
+def test_a_day_has_flat_memory_and_exact_stamps(native_path, tmp_path, storage, length):
     steps = length(DAY, 60_000)
     bag = tmp_path / "bag"
     command = [sys.executable, "-c", RUN, str(native_path), str(bag), storage, str(steps)]

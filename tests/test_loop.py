@@ -1,9 +1,6 @@
 """The loop of a live page, without the page: requests, updates, and ends of a recording."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Thread
 
@@ -22,7 +19,7 @@ def loop_of(fmu: Path) -> Loop:
     return Loop(experiment(fmu, stop_time=np.inf))
 
 
-def test_the_end_does_not_wait_for_orders(native_path: Path) -> None:
+def test_the_end_does_not_wait_for_orders(native_path):
     """Some of which take long."""
     loop, asked = loop_of(native_path), iter([False, True])
     for _ in range(5):
@@ -32,7 +29,7 @@ def test_the_end_does_not_wait_for_orders(native_path: Path) -> None:
 
 
 @pytest.mark.parametrize("everything", [False, True])
-def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> None:
+def test_orders_are_carried_out_in_turn(native_path, everything):
     """Values set before a step hold for it, and values set after a reset are not reset."""
     loop = loop_of(native_path)
     for order, value in (
@@ -52,7 +49,7 @@ def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> 
     assert news["rows"][-1][-2:] == target
 
 
-def test_there_are_no_news_of_a_run_without_a_sample(native_path: Path) -> None:
+def test_there_are_no_news_of_a_run_without_a_sample(native_path):
     """While a page asks for them all the time."""
     loop, ended, counts = loop_of(native_path), Event(), set()
 
@@ -75,7 +72,7 @@ def test_there_are_no_news_of_a_run_without_a_sample(native_path: Path) -> None:
     assert counts <= {1, 2}
 
 
-def test_orders_of_one_kind_become_one(native_path: Path) -> None:
+def test_orders_of_one_kind_become_one(native_path):
     """The newest value wins, where nothing else is between them."""
     loop = loop_of(native_path)
     for k in range(10_000):
@@ -91,7 +88,7 @@ def test_orders_of_one_kind_become_one(native_path: Path) -> None:
     assert loop.news()["values"]["x_des[1]"] == 0.2
 
 
-def test_orders_of_several_kinds_are_all_done(native_path: Path) -> None:
+def test_orders_of_several_kinds_are_all_done(native_path):
     """Further requests have to wait."""
     loop = loop_of(native_path)
     for k in range(100):
@@ -101,7 +98,7 @@ def test_orders_of_several_kinds_are_all_done(native_path: Path) -> None:
     assert (loop.news()["t"], loop.news()["values"]["x_des[1]"]) == (0.5, 0.099)
 
 
-def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path: Path) -> None:
+def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path):
     loop, told = loop_of(native_path), [{"payload": 0.3}, {"x_des[1]": 0.11}, None, {"rtol": 0.0}]
 
     def stop() -> bool:
@@ -117,7 +114,7 @@ def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path: Path
     assert values == [0.11, 0.3, 1e-3]
 
 
-def test_full_disk_ends_the_recording_alone(native_path: Path, disk: Callable[..., Path]) -> None:
+def test_full_disk_ends_the_recording_alone(native_path, disk):
     """One note says so, and a second one that another recording cannot begin."""
     bag = disk(8192) / "bag"
     loop, ended = Loop(experiment(native_path, stop_time=np.inf), bag=str(bag)), Event()
@@ -150,7 +147,7 @@ def test_full_disk_ends_the_recording_alone(native_path: Path, disk: Callable[..
     assert not bag.with_name("bag-2").exists()
 
 
-def test_a_gain_below_0_is_refused_before_it_ends_the_run(native_path: Path) -> None:
+def test_a_gain_below_0_is_refused_before_it_ends_the_run(native_path):
     loop = loop_of(native_path)
     with pytest.raises(InputError, match=r"Kp\[1\] = -5 is less than 0"):
         loop.tell("change", {"Kp": -5.0})

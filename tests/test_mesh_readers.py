@@ -1,7 +1,5 @@
 """Meshes that break their reader: one warning that names them, and the others are drawn."""
 
-from __future__ import annotations
-
 import json
 import resource
 import struct
@@ -70,9 +68,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize(("suffix", "content", "reason"), HOSTILE.values(), ids=HOSTILE)
-def test_a_hostile_mesh_is_one_warning(
-    suffix: str, content: bytes, reason: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_hostile_mesh_is_one_warning(suffix, content, reason, caplog):
     """The meshes before and after it are drawn; time and memory are bounded."""
     files = {"a.stl": STL, f"bad{suffix}": content, "b.stl": STL}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -86,12 +82,12 @@ def test_a_hostile_mesh_is_one_warning(
     assert after.ru_maxrss * 1024 < max(MAX_MESH_MEMORY, before.ru_maxrss * 1024 + 1)
 
 
-def test_instances_that_can_be_drawn_are() -> None:
+def test_instances_that_can_be_drawn_are():
     with Meshes({"a.dae": doubling(5)}.get) as meshes:
         assert sum(len(part.triangles) for part in meshes.scaled("a.dae", ONE)) == 32
 
 
-def test_few_meshes_may_end_their_reader(caplog: pytest.LogCaptureFixture) -> None:
+def test_few_meshes_may_end_their_reader(caplog):
     """Each costs the start of a process: a thousand of them would take minutes."""
     names = [f"{i}.dae" for i in range(50)]
     with Meshes(dict.fromkeys(names, ITSELF).get) as meshes:
@@ -101,7 +97,7 @@ def test_few_meshes_may_end_their_reader(caplog: pytest.LogCaptureFixture) -> No
     assert sum("other meshes crash their reader" in text for text in texts) == 50 - MAX_FATAL_MESHES
 
 
-def test_time_of_a_robots_meshes_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_time_of_a_robots_meshes_is_bounded(monkeypatch, caplog):
     """Each of them takes less than one mesh may; a fresh reader has what the ones before it left."""
     monkeypatch.setattr(meshes_module, "MAX_MESHES_SECONDS", 3)
     names = [f"{i}.dae" for i in range(24)]
@@ -114,7 +110,7 @@ def test_time_of_a_robots_meshes_is_bounded(monkeypatch: pytest.MonkeyPatch, cap
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 6
 
 
-def test_triangles_of_a_robot_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
+def test_triangles_of_a_robot_are_bounded(caplog):
     """A page of them would take gigabytes, whether of one file or of many uses of one."""
     many = MAX_TRIANGLES // 4
     content = bytes(80) + struct.pack("<I", many) + FACET * many
@@ -125,7 +121,7 @@ def test_triangles_of_a_robot_are_bounded(caplog: pytest.LogCaptureFixture) -> N
     assert f"more than {MAX_TRIANGLES} triangles" in record.getMessage()
 
 
-def test_without_trimesh_a_dae_has_no_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_trimesh_a_dae_has_no_colours(monkeypatch):
     monkeypatch.setattr(meshes_module, "find_spec", {"collada": True}.get)
     with Meshes({"a.dae": doubling(1)}.get) as meshes:
         (part,) = meshes.scaled("a.dae", ONE)
@@ -133,9 +129,7 @@ def test_without_trimesh_a_dae_has_no_colours(monkeypatch: pytest.MonkeyPatch) -
     assert part.colour is None and len(part.triangles) == 2
 
 
-def test_without_coal_a_mesh_is_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_coal_a_mesh_is_left_out(tmp_path, monkeypatch, caplog):
     """Its package is named; one child says so for all meshes."""
     (tmp_path / "coal.py").write_text("raise ImportError('there is no coal', name='coal')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -174,9 +168,7 @@ FORGED = {
 
 
 @pytest.mark.parametrize(("answers", "reason"), FORGED.values(), ids=FORGED)
-def test_answers_of_a_reader_in_the_power_of_its_file(
-    answers: list[bytes], reason: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_answers_of_a_reader_in_the_power_of_its_file(answers, reason, monkeypatch, caplog):
     """Injected code may send what it likes; a pickle would be a program."""
     monkeypatch.setattr(meshes_module, "serve", forging(answers))
     with Meshes({"a.stl": STL}.get) as meshes:
@@ -204,9 +196,7 @@ ROBOT = """<robot name="pair"><link name="base"/><link name="arm"><inertial><mas
 </joint></robot>"""
 
 
-def test_all_that_draws_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_all_that_draws_goes_on(tmp_path, monkeypatch, caplog):
     """run --scene, view and page of a robot with such a mesh; build takes the file along."""
     monkeypatch.chdir(tmp_path)
     for name, content in {"r.urdf": ROBOT.encode(), "bad.dae": ITSELF, "good.stl": STL}.items():

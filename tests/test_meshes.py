@@ -4,8 +4,6 @@ Mass properties are computed here by trimesh, from the committed files and the d
 URDF states; the script that made the files has its own integrals.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -55,7 +53,7 @@ def numbers(element: ElementTree.Element, path: str, attribute: str) -> list[flo
 
 
 @pytest.mark.parametrize("name", VISUAL + COLLISION)
-def test_mesh_is_closed_and_oriented_outwards(name: str) -> None:
+def test_mesh_is_closed_and_oriented_outwards(name):
     corners = facets(name)
     edges = Counter(
         (tuple(triangle[i]), tuple(triangle[(i + 1) % 3])) for triangle in corners.tolist() for i in range(3)
@@ -71,7 +69,7 @@ def test_mesh_is_closed_and_oriented_outwards(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", VISUAL + COLLISION)
-def test_triangles_have_a_size_and_their_own_normals(name: str) -> None:
+def test_triangles_have_a_size_and_their_own_normals(name):
     a, b, c = facets(name).transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -82,14 +80,14 @@ def test_triangles_have_a_size_and_their_own_normals(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COLLISION)
-def test_collision_mesh_is_small_and_convex(name: str) -> None:
+def test_collision_mesh_is_small_and_convex(name):
     surface = mesh(name)
     assert len(surface.faces) < 200
     assert surface.volume == pytest.approx(surface.convex_hull.volume, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", LINKS)
-def test_collision_mesh_encloses_the_visual_mesh(name: str) -> None:
+def test_collision_mesh_encloses_the_visual_mesh(name):
     # inside a convex body is behind each of its faces
     hull = mesh(f"{name}_collision.stl")
     points = facets(f"{name}.stl").reshape(-1, 3)
@@ -102,18 +100,18 @@ def test_collision_mesh_encloses_the_visual_mesh(name: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["", "_collision"])
-def test_links_are_apart_at_any_angle(suffix: str) -> None:
+def test_links_are_apart_at_any_angle(suffix):
     assert facets(f"link1{suffix}.stl")[..., 2].max() < 0.0
     assert facets(f"link2{suffix}.stl")[..., 2].min() >= 0.0
 
 
-def test_tool_tip_is_the_end_effector() -> None:
+def test_tool_tip_is_the_end_effector():
     tip = min(facets("link2.stl").reshape(-1, 3), key=lambda corner: corner[2])
     np.testing.assert_allclose(tip, [0.15, 0.0, 0.0], atol=PRECISION)
 
 
 @pytest.mark.parametrize("name", LINKS)
-def test_inertial_is_that_of_the_mesh(name: str) -> None:
+def test_inertial_is_that_of_the_mesh(name):
     stated = re.search(r"Density: (\S+) kg/m3", URDF.read_text(encoding="utf-8"))
     assert stated is not None
     surface = mesh(f"{name}.stl")
@@ -129,7 +127,7 @@ def test_inertial_is_that_of_the_mesh(name: str) -> None:
     np.testing.assert_allclose(inertia, surface.moment_inertia, rtol=1e-9, atol=1e-15)
 
 
-def test_script_reproduces_the_files(tmp_path: Path) -> None:
+def test_script_reproduces_the_files(tmp_path):
     script = ROOT / "meshes" / "make_meshes.py"
     subprocess.run([sys.executable, script, tmp_path], check=True, capture_output=True)
     committed = {path.name: path.read_bytes() for path in (ROOT / "meshes").glob("*.stl")}
@@ -137,7 +135,7 @@ def test_script_reproduces_the_files(tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == committed
 
 
-def test_pinocchio_loads_the_robot() -> None:
+def test_pinocchio_loads_the_robot():
     model = pin.buildModelFromUrdf(str(URDF))
     data = model.createData()
     assert model.name == "2dof"
@@ -156,7 +154,7 @@ def test_pinocchio_loads_the_robot() -> None:
     np.testing.assert_array_equal(model.velocityLimit, [20.0, 20.0])
 
 
-def test_pinocchio_finds_the_meshes() -> None:
+def test_pinocchio_finds_the_meshes():
     model = pin.buildModelFromUrdf(str(URDF))
     for kind, names in ((pin.VISUAL, VISUAL), (pin.COLLISION, COLLISION)):
         geometry = pin.buildGeomFromUrdf(model, str(URDF), kind, package_dirs=[str(ROOT)])

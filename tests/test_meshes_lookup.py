@@ -1,7 +1,5 @@
 """Meshes of a URDF: the folders that are searched, names in the FMU, and refusals."""
 
-from __future__ import annotations
-
 import os
 import re
 import xml.etree.ElementTree as ET
@@ -27,7 +25,7 @@ FILES = {
 
 
 @pytest.fixture
-def disk(tmp_path: Path) -> Path:
+def disk(tmp_path):
     for name, content in FILES.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,7 +79,7 @@ FOUND = {
 
 
 @pytest.mark.parametrize(("uri", "mesh_dir", "content"), FOUND.values(), ids=FOUND)
-def test_mesh_is_found(disk: Path, uri: str, mesh_dir: str | None, content: bytes) -> None:
+def test_mesh_is_found(disk, uri, mesh_dir, content):
     (disk / "ws/arm_description/urdf/link.stl").symlink_to("../meshes/base.stl")
     assert collect(disk, uri, mesh_dir) == content
 
@@ -96,12 +94,12 @@ def test_mesh_is_found(disk: Path, uri: str, mesh_dir: str | None, content: byte
     ],
     ids=["URDF's folder", "URDF's package", "mesh_dir"],
 )
-def test_absolute_name_is_found_where_meshes_may_be(disk: Path, scheme: str, name: str, mesh_dir: str | None) -> None:
+def test_absolute_name_is_found_where_meshes_may_be(disk, scheme, name, mesh_dir):
     content = FILES[f"ws/{name}"]
     assert collect(disk, f"{scheme}{disk}/ws/{name}", mesh_dir) == content
 
 
-def test_package_in_mesh_dir_goes_before_a_shorter_match(disk: Path) -> None:
+def test_package_in_mesh_dir_goes_before_a_shorter_match(disk):
     (disk / "ws/meshes").mkdir()
     (disk / "ws/meshes/base.stl").write_bytes(b"other")
     assert collect(disk, PACKAGE, "ws") == b"base"
@@ -140,9 +138,7 @@ ELSEWHERE = {
 
 
 @pytest.mark.parametrize(("uri", "mesh_dir"), ABSENT.values(), ids=ABSENT)
-def test_warning_names_the_mesh_that_is_left_out(
-    disk: Path, uri: str, mesh_dir: str | None, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_warning_names_the_mesh_that_is_left_out(disk, uri, mesh_dir, caplog):
     text, files = collect_meshes(
         urdf(uri), disk / "ws/arm_description/urdf", None if mesh_dir is None else disk / mesh_dir
     )
@@ -150,7 +146,7 @@ def test_warning_names_the_mesh_that_is_left_out(
 
 
 @pytest.mark.parametrize(("uri", "mesh_dir"), ELSEWHERE.values(), ids=ELSEWHERE)
-def test_refusal_names_the_mesh_and_where_it_may_be(disk: Path, uri: str, mesh_dir: str | None) -> None:
+def test_refusal_names_the_mesh_and_where_it_may_be(disk, uri, mesh_dir):
     uri = uri.format(disk=disk)
     (disk / "ws2").mkdir()
     (disk / "ws2/secret.stl").write_bytes(b"secret")
@@ -160,13 +156,13 @@ def test_refusal_names_the_mesh_and_where_it_may_be(disk: Path, uri: str, mesh_d
     assert f"'{disk / (mesh_dir or 'ws/arm_description')}'" in str(refusal.value)
 
 
-def test_too_long_a_name_is_refused(disk: Path) -> None:
+def test_too_long_a_name_is_refused(disk):
     with pytest.raises(BuildError, match=r"cannot be read: .*too long"):
         collect(disk, "package://arm/" + "a" * 5000, "ws")
 
 
 @pytest.mark.parametrize("uri", ["../meshes/base.stl", PACKAGE])
-def test_folder_of_the_urdf_alone_where_there_is_no_package(disk: Path, uri: str) -> None:
+def test_folder_of_the_urdf_alone_where_there_is_no_package(disk, uri):
     """The names of parent folders have no effect: the home folder has a name too."""
     (disk / "ws/arm_description/package.xml").unlink()
     with pytest.raises(BuildError, match="not found in"):
@@ -177,7 +173,7 @@ def test_folder_of_the_urdf_alone_where_there_is_no_package(disk: Path, uri: str
 
 @pytest.mark.parametrize("mesh_dir", ["ws", None])
 @pytest.mark.parametrize("link", ["meshes/link.stl", "urdf/link.stl", "more", "meshes/more"])
-def test_symbolic_link_out_of_the_places_is_refused(disk: Path, link: str, mesh_dir: str | None) -> None:
+def test_symbolic_link_out_of_the_places_is_refused(disk, link, mesh_dir):
     folder = disk / "ws/arm_description"
     folder.joinpath(link).symlink_to(disk if "more" in link else disk / "secret.stl")
     name = f"{link}/secret.stl" if "more" in link else link
@@ -186,7 +182,7 @@ def test_symbolic_link_out_of_the_places_is_refused(disk: Path, link: str, mesh_
             collect(disk, uri, mesh_dir)
 
 
-def test_mesh_that_cannot_be_read_is_refused(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_that_cannot_be_read_is_refused(disk, monkeypatch):
     def fail(path: Path, _flags: int) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
@@ -195,32 +191,32 @@ def test_mesh_that_cannot_be_read_is_refused(disk: Path, monkeypatch: pytest.Mon
         collect(disk, PACKAGE, "ws")
 
 
-def test_meshes_of_one_basename_get_different_names(disk: Path) -> None:
+def test_meshes_of_one_basename_get_different_names(disk):
     uris = [f"package://arm_description/meshes/{kind}/link.stl" for kind in ("visual", "collision")]
     text, files = collect_meshes(urdf(*uris), disk, disk / "ws")
     assert len(set(names(text))) == 2
     assert [files[name] for name in names(text)] == [b"visual", b"collision"]
 
 
-def test_a_mesh_used_twice_is_taken_along_once(disk: Path) -> None:
+def test_a_mesh_used_twice_is_taken_along_once(disk):
     text, files = collect_meshes(urdf(PACKAGE, PACKAGE), disk, disk / "ws")
     assert names(text) == ["meshes/base.stl"] * 2
     assert files == {"meshes/base.stl": b"base"}
 
 
-def test_nothing_but_the_names_of_meshes_changes(disk: Path) -> None:
+def test_nothing_but_the_names_of_meshes_changes(disk):
     before = urdf(PACKAGE).replace("<link", '<!-- <mesh filename="package://old/gone.stl"/> -->\n<link\n  ')
     after, _ = collect_meshes(before, disk, disk / "ws")
     expected = before.replace(PACKAGE, "package://meshes/base.stl")
     assert ET.canonicalize(after, with_comments=True) == ET.canonicalize(expected, with_comments=True)
 
 
-def test_characters_that_trouble_file_systems_are_replaced(disk: Path) -> None:
+def test_characters_that_trouble_file_systems_are_replaced(disk):
     _, files = collect_meshes(urdf("package://arm_description/meshes/with%20space%20%26%20more.stl"), disk, disk / "ws")
     assert list(files) == ["meshes/with_space___more.stl"]
 
 
-def test_collected_robot_collects_again_from_what_was_collected(disk: Path, tmp_path: Path) -> None:
+def test_collected_robot_collects_again_from_what_was_collected(disk, tmp_path):
     uris = [f"package://arm_description/meshes/{kind}/link.stl" for kind in ("visual", "collision")]
     text, files = collect_meshes(urdf(PACKAGE, *uris), disk, disk / "ws")
     for name, content in files.items():
@@ -239,7 +235,7 @@ EXAMPLES = {
 
 
 @pytest.mark.parametrize(("name", "count"), EXAMPLES.items(), ids=[Path(e).stem for e in EXAMPLES])
-def test_example_robot_needs_no_mesh_dir(robots: Path, name: str, count: int) -> None:
+def test_example_robot_needs_no_mesh_dir(robots, name, count):
     path = robots / name
     text, files = collect_meshes(path.read_text("utf-8"), path.parent, None)
     assert len(files) == count
@@ -255,7 +251,7 @@ LIBRARY = {
 
 
 @pytest.mark.parametrize(("name", "content"), LIBRARY.values(), ids=LIBRARY)
-def test_an_obj_brings_the_library_of_its_colours(disk: Path, name: str, content: bytes | None) -> None:
+def test_an_obj_brings_the_library_of_its_colours(disk, name, content):
     folder = disk / "ws/arm_description/meshes"
     (folder / "box.obj").write_text(f"# a box\r\nmtllib {name}\r\nv 0 0 0\r\n")
     if content:
@@ -265,7 +261,7 @@ def test_an_obj_brings_the_library_of_its_colours(disk: Path, name: str, content
     assert libraries == ({"meshes/box.obj.mtl": content.strip()} if content else {})
 
 
-def test_a_library_outside_of_the_folders_is_refused(disk: Path) -> None:
+def test_a_library_outside_of_the_folders_is_refused(disk):
     path = disk / "ws/arm_description/meshes/box.obj"
     path.write_text("mtllib ../../../secret.stl\n")
     with pytest.raises(BuildError, match=r"secret\.stl.* may come from nowhere else"):

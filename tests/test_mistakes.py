@@ -1,7 +1,5 @@
 """Common mistakes of users: each message names the culprit and a remedy that works."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable
@@ -115,7 +113,7 @@ MISTAKES: dict[str, str] = {
 
 
 @pytest.fixture(scope="module")
-def things(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def things(native_path, tmp_path_factory):
     """A folder as of somebody who has worked for an hour."""
     folder = tmp_path_factory.mktemp("hour")
     shutil.copy(native_path, folder / "arm.fmu")
@@ -140,9 +138,7 @@ def things(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("line", MISTAKES)
-def test_a_mistake_gets_its_remedy(
-    line: str, things: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_gets_its_remedy(line, things, monkeypatch, capsys):
     monkeypatch.chdir(things)
     before = sorted(things.iterdir())
     try:
@@ -225,7 +221,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
 
 
 @pytest.mark.parametrize("mistake", CALLS)
-def test_a_mistake_in_python_gets_its_remedy(mistake: str, things: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mistake_in_python_gets_its_remedy(mistake, things, monkeypatch):
     monkeypatch.chdir(things)
     call, words = CALLS[mistake]
     with pytest.raises((twodof.TwoDofError, TypeError, AttributeError), match=words):

@@ -1,7 +1,5 @@
 """The notebooks of ``examples`` run, and the outputs stored in them are those of this version."""
 
-from __future__ import annotations
-
 import ast
 import re
 import runpy
@@ -39,12 +37,12 @@ def without_numbers(output: nbformat.NotebookNode) -> str:
     return "a page" if html.startswith("<iframe") else re.sub(r"-?\d+(\.\d+)?(e[-+]\d+)?", "N", html)
 
 
-def test_each_notebook_is_there() -> None:
+def test_each_notebook_is_there():
     assert {path.stem for path in EXAMPLES.glob("*.ipynb")} == {*NOTEBOOKS} == {*PICTURES}
 
 
 @pytest.mark.parametrize("name", sorted(NOTEBOOKS))
-def test_a_notebook_runs_and_its_stored_outputs_are_current(name: str, tmp_path: Path) -> None:
+def test_a_notebook_runs_and_its_stored_outputs_are_current(name, tmp_path):
     path = EXAMPLES / f"{name}.ipynb"
     stored = nbformat.read(path, as_version=4)
     before = outputs(stored)
@@ -56,16 +54,14 @@ def test_a_notebook_runs_and_its_stored_outputs_are_current(name: str, tmp_path:
     assert path.stat().st_size < MAX_SIZE
 
 
-def test_an_arm_is_shown_without_what_takes_long_to_import(native_path: Path) -> None:
+def test_an_arm_is_shown_without_what_takes_long_to_import(native_path):
     code = "import sys, twodof; twodof.show(sys.argv[1]); print({*sys.modules} & {'matplotlib', 'pinocchio', 'pandas'})"
     done = subprocess.run([sys.executable, "-c", code, native_path], check=True, stdout=subprocess.PIPE, text=True)
     assert done.stdout == "set()\n"
 
 
 @pytest.mark.parametrize(("silence", "shown"), [(0, True), (1e6, False)])
-def test_a_notebook_shows_bars_of_what_takes_long(
-    native_path: Path, tmp_path: Path, silence: float, shown: bool
-) -> None:
+def test_a_notebook_shows_bars_of_what_takes_long(native_path, tmp_path, silence, shown):
     """Text where ipywidgets are missing, else widgets; a script shows none."""
     shutil.copy(native_path, tmp_path / "arm.fmu")
     begin = f"import os, twodof\nfrom twodof.simulation import progress\nprogress.SILENCE = {silence}"
@@ -81,7 +77,7 @@ def test_a_notebook_shows_bars_of_what_takes_long(
 
 
 @pytest.mark.parametrize(("tick", "shown"), [(0.05, True), (1e6, False)])
-def test_a_notebook_shows_a_line_of_a_slow_build(tmp_path: Path, tick: float, shown: bool) -> None:
+def test_a_notebook_shows_a_line_of_a_slow_build(tmp_path, tick, shown):
     """Each text of the line, and the cell's output once the build is done; a script shows none."""
     begin = f"import os, twodof\nfrom twodof import notebook\nnotebook.TICK = {tick}"
     begin += "\nos.environ.pop('TQDM_DISABLE', None);"
@@ -102,13 +98,13 @@ DisplayHandle.display, DisplayHandle.update = watched(DisplayHandle.display), wa
     assert (script.returncode, script.stdout, script.stderr) == (0, b"", b"")
 
 
-def test_a_cell_that_fails_is_an_error(tmp_path: Path) -> None:
+def test_a_cell_that_fails_is_an_error(tmp_path):
     notebook = notebook_of(("import twodof\ntwodof.load_fmu('absent.fmu')",))
     with pytest.raises(nbclient.exceptions.CellExecutionError, match=r"there is no FMU 'absent\.fmu'"):
         executed(notebook, tmp_path)
 
 
-def test_pages_are_shown_inline_without_a_network(native_path: Path, tmp_path: Path) -> None:
+def test_pages_are_shown_inline_without_a_network(native_path, tmp_path):
     """An arm that moves, a replay and a map, in the frames that a notebook puts into its page."""
     folder = tmp_path / "sweep"
     twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=1)
@@ -130,6 +126,6 @@ def test_pages_are_shown_inline_without_a_network(native_path: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("other", [3, [1.0, 2.0]])
-def test_what_cannot_be_shown_is_said(other: object) -> None:
+def test_what_cannot_be_shown_is_said(other):
     with pytest.raises(twodof.TwoDofError, match="`show` shows an FMU, a recording, the table of a sweep, or the path"):
         twodof.show(other)

@@ -1,7 +1,5 @@
 """Downsampling of a long bag for drawing keeps everything that a picture shows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ MOST = 2000
 
 
 @pytest.fixture(scope="module")
-def bag(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag(native_path, tmp_path_factory):
     """A run of 20,000 steps whose target, given on a topic too, jumps often; for one step once."""
     folder = tmp_path_factory.mktemp("long")
     table = folder / "targets.csv"
@@ -44,7 +42,7 @@ def lines_of(track: Track) -> list[Array]:
     return [*joints, *track.motion.path.T, track.task.error, track.task.off]
 
 
-def test_every_line_keeps_its_extremes_wherever_it_is_looked_at(bag: Path) -> None:
+def test_every_line_keeps_its_extremes_wherever_it_is_looked_at(bag):
     """In each twentieth of the time, with no more between than that of the spans at its ends."""
     whole, few = track_of(bag, 10**6), track_of(bag, MOST)
     assert len(whole.t) == whole.recording.count == few.recording.count == 20_001
@@ -59,7 +57,7 @@ def test_every_line_keeps_its_extremes_wherever_it_is_looked_at(bag: Path) -> No
             assert some[here].max() >= np.sort(every[low:high])[-len(every) // 50]
 
 
-def test_what_is_told_of_a_long_bag_is_told_of_all_its_samples(bag: Path) -> None:
+def test_what_is_told_of_a_long_bag_is_told_of_all_its_samples(bag):
     whole, few = track_of(bag, 10**6), track_of(bag, MOST)
     assert whole.task is not None and few.task is not None
     assert few.task.off is not None and whole.task.off is not None
@@ -70,7 +68,7 @@ def test_what_is_told_of_a_long_bag_is_told_of_all_its_samples(bag: Path) -> Non
     assert few.settings == whole.settings
 
 
-def test_a_target_on_a_topic_is_that_of_its_time(bag: Path, tmp_path: Path) -> None:
+def test_a_target_on_a_topic_is_that_of_its_time(bag, tmp_path):
     """The bag has no provenance; repeated points are not kept."""
     (bag / "run.json").rename(tmp_path / "run.json")
     try:
@@ -83,7 +81,7 @@ def test_a_target_on_a_topic_is_that_of_its_time(bag: Path, tmp_path: Path) -> N
     assert few.target[:, 0].max() == 50.0
 
 
-def test_a_bag_that_is_not_long_is_read_whole(bag: Path) -> None:
+def test_a_bag_that_is_not_long_is_read_whole(bag):
     def none(part: Recording) -> list[Array]:
         raise AssertionError
 
@@ -91,7 +89,7 @@ def test_a_bag_that_is_not_long_is_read_whole(bag: Path) -> None:
     np.testing.assert_array_equal(read.q, read_bag(bag).q)
 
 
-def test_extremes_are_those_of_each_part() -> None:
+def test_extremes_are_those_of_each_part():
     random = np.random.default_rng(0)
     parts = np.sort(random.integers(0, 50, 1000)) * 3
     lines = list(random.normal(size=(3, 1000)))

@@ -1,7 +1,5 @@
 """Output files are written completely or not at all, through links, with the mode of the umask."""
 
-from __future__ import annotations
-
 import io
 import os
 import shutil
@@ -9,7 +7,6 @@ import stat
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Thread
 
@@ -23,7 +20,7 @@ OLD, NEW = b"old", b"new" * 100_000
 
 
 @pytest.fixture
-def umask() -> Iterator[Callable[[int], int]]:
+def umask():
     """Sets the umask for a test."""
     before = os.umask(0o022)
     yield os.umask
@@ -34,7 +31,7 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_a_link_stays_and_its_target_is_replaced(tmp_path: Path) -> None:
+def test_a_link_stays_and_its_target_is_replaced(tmp_path):
     folder, other = tmp_path / "a", tmp_path / "b"
     folder.mkdir()
     other.mkdir()
@@ -53,7 +50,7 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["a", "b", "far", "file", "near"]
 
 
-def test_a_link_to_itself_is_no_file(tmp_path: Path) -> None:
+def test_a_link_to_itself_is_no_file(tmp_path):
     link = tmp_path / "link"
     link.symlink_to("link")
     with pytest.raises(OSError, match="symbolic links"):
@@ -62,9 +59,7 @@ def test_a_link_to_itself_is_no_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077, 0o002, 0o027])
-def test_modes_are_those_of_the_umask(
-    mask: int, umask: Callable[[int], int], tmp_path: Path, native_path: Path
-) -> None:
+def test_modes_are_those_of_the_umask(mask, umask, tmp_path, native_path):
     """All files that verbs write have the mode of a shell's redirection."""
     umask(mask)
     shutil.copyfile(native_path, tmp_path / "a.fmu")
@@ -86,7 +81,7 @@ def test_modes_are_those_of_the_umask(
     assert modes == {p: (0o777 if p.is_dir() else 0o666) & ~mask for p in modes}
 
 
-def test_a_file_that_is_replaced_keeps_its_mode(umask: Callable[[int], int], tmp_path: Path) -> None:
+def test_a_file_that_is_replaced_keeps_its_mode(umask, tmp_path):
     """A private file must not become one that all may read."""
     umask(0o022)
     path = tmp_path / "file"
@@ -98,7 +93,7 @@ def test_a_file_that_is_replaced_keeps_its_mode(umask: Callable[[int], int], tmp
         path.chmod(0o600)
 
 
-def test_pipes_and_devices_are_written_to(tmp_path: Path) -> None:
+def test_pipes_and_devices_are_written_to(tmp_path):
     pipe, link, null = tmp_path / "pipe", tmp_path / "link", tmp_path / "null"
     os.mkfifo(pipe)
     link.symlink_to("pipe")
@@ -119,7 +114,7 @@ def test_pipes_and_devices_are_written_to(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "null", "pipe"]
 
 
-def test_a_disk_that_is_full_leaves_the_old_file(disk: Callable[..., Path]) -> None:
+def test_a_disk_that_is_full_leaves_the_old_file(disk):
     path = disk(128) / "file"
     path.write_bytes(OLD)
     with pytest.raises(OSError, match="No space"):
@@ -128,7 +123,7 @@ def test_a_disk_that_is_full_leaves_the_old_file(disk: Callable[..., Path]) -> N
 
 
 @pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> Path:
+def bag(tmp_path_factory, native_path):
     folder = tmp_path_factory.mktemp("outputs")
     twodof.simulate(native_path, twodof.Bag(folder / "bag"), stop_time=0.05)
     return folder / "bag"
@@ -143,7 +138,7 @@ def twodof_to(output: int | io.BufferedRandom, *arguments: object) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
-def test_a_page_goes_to_the_standard_output(name: str, bag: Path, tmp_path: Path) -> None:
+def test_a_page_goes_to_the_standard_output(name, bag, tmp_path):
     """A command as root once replaced /dev/stdout. Facts go to stderr, and not into the page."""
     before = os.readlink("/dev/stdout")
     if name == "link":
@@ -160,7 +155,7 @@ def test_a_page_goes_to_the_standard_output(name: str, bag: Path, tmp_path: Path
     assert os.readlink("/dev/stdout") == before
 
 
-def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(bag: Path, native_path: Path, tmp_path: Path) -> None:
+def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(bag, native_path, tmp_path):
     assert twodof_to(subprocess.PIPE, "plot", bag, "-o", "-").startswith(b"\x89PNG")
     page = twodof_to(subprocess.PIPE, "page", native_path, "-o", "-")
     assert page.startswith(b"<!DOCTYPE html>") and page.endswith(b"</html>\n")

@@ -1,7 +1,5 @@
 """The artists of a figure of runs, against the FMU's own samples and closed forms."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
@@ -14,8 +12,7 @@ import oracles
 import pytest
 from figures import assert_legible, heights, key, key_of, legend_of, lines, notes, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from recordings import LINK, Recording, build, chain_urdf, long_run, record
+from recordings import LINK, build, chain_urdf, long_run, record
 from sinks import Collector
 
 import twodof
@@ -30,11 +27,11 @@ from twodof.plots.words import labels, outcome
 
 
 @pytest.fixture(scope="module")
-def figure(default: Recording) -> Figure:
+def figure(default):
     return plot(default.bag)
 
 
-def test_joints_are_drawn_as_the_fmu_gave_them(default: Recording, figure: Figure) -> None:
+def test_joints_are_drawn_as_the_fmu_gave_them(default, figure):
     found = panels(figure)
     assert len(found.q) == len(found.v) == 2
     for i in range(2):
@@ -47,7 +44,7 @@ def test_joints_are_drawn_as_the_fmu_gave_them(default: Recording, figure: Figur
             assert axes.get_xlim() == (0.0, 5.0)
 
 
-def test_units_and_settings_are_told(figure: Figure) -> None:
+def test_units_and_settings_are_told(figure):
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad"
     assert found.v[0].get_title("left") == "Velocity in rad/s"
@@ -65,7 +62,7 @@ def test_units_and_settings_are_told(figure: Figure) -> None:
     assert key_of(figure) == []
 
 
-def test_path_and_arm_are_those_of_the_closed_form(default: Recording, figure: Figure) -> None:
+def test_path_and_arm_are_those_of_the_closed_form(default, figure):
     (view,) = panels(figure).views
     q = default.q
     path = only(view, "path")
@@ -82,7 +79,7 @@ def test_path_and_arm_are_those_of_the_closed_form(default: Recording, figure: F
     assert angles[-1] - angles[0] == pytest.approx(2 * math.pi)
 
 
-def test_a_metre_is_as_long_up_as_across(default: Recording) -> None:
+def test_a_metre_is_as_long_up_as_across(default):
     figure = plot(default.bag)
     (view,) = panels(figure).views
     FigureCanvasAgg(figure).draw()
@@ -96,7 +93,7 @@ def test_a_metre_is_as_long_up_as_across(default: Recording) -> None:
     assert left > -LINK  # of the circle of reach a part
 
 
-def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default: Recording, figure: Figure) -> None:
+def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default, figure):
     error = panels(figure).error
     assert error is not None
     assert error.get_yscale() == "log"
@@ -111,7 +108,7 @@ def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default: R
     assert legend_of(error) == ["closed form"]
 
 
-def test_what_came_out_is_told(default: Recording, figure: Figure) -> None:
+def test_what_came_out_is_told(default, figure):
     left = np.linalg.norm(default.x[-1] - (0.2, 0.05))
     told = "\n".join(texts(figure))
     found = re.search(r"^reached: (\S+) m from the target .*^at most (\S+) m from the closed form", told, re.M | re.S)
@@ -123,7 +120,7 @@ def test_what_came_out_is_told(default: Recording, figure: Figure) -> None:
 # --- limits and targets ---
 
 
-def test_limits_are_lines_that_are_in_view_where_they_are_near(fmu_path: Path, tmp_path: Path) -> None:
+def test_limits_are_lines_that_are_in_view_where_they_are_near(fmu_path, tmp_path):
     """The second joint stops at 1.2 rad, far from its lower limit."""
     recording = record(tmp_path / "bag", fmu_path, settings={"q_max": (0.9, 1.2), "x_des": (-0.1, 0.2)})
     assert recording.q[-1, 1] == 1.2
@@ -140,7 +137,7 @@ def test_limits_are_lines_that_are_in_view_where_they_are_near(fmu_path: Path, t
     assert not any(lines(axes, "limit") for axes in found.v)
 
 
-def test_equal_limits_are_told_once(figure: Figure) -> None:
+def test_equal_limits_are_told_once(figure):
     first = panels(figure).q[0]
     assert heights(first, "limit") == [-math.pi, math.pi]
     assert notes(first) == ["limits ±3.14"]
@@ -148,7 +145,7 @@ def test_equal_limits_are_told_once(figure: Figure) -> None:
     assert -math.pi < low < high < math.pi  # both far away
 
 
-def test_efforts_are_drawn_with_their_limits(fmu_path: Path, tmp_path: Path) -> None:
+def test_efforts_are_drawn_with_their_limits(fmu_path, tmp_path):
     bag, samples = tmp_path / "bag", Collector()
     twodof.simulate(fmu_path, samples, twodof.Bag(bag, effort=True), stop_time=0.3)
     figure = plot(bag)
@@ -160,7 +157,7 @@ def test_efforts_are_drawn_with_their_limits(fmu_path: Path, tmp_path: Path) -> 
     assert_legible(figure)
 
 
-def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path: Path) -> None:
+def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path):
     """As the FMU's output has them, limited to 9 N·m or not."""
     fmu = build(tmp_path, chain_urdf("zz"), control="effort")
     (tmp_path / "in.csv").write_text("time,tau_cmd[1]\n0,1\n0.02,12\n0.04,-2\n")
@@ -178,7 +175,7 @@ def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path: Pa
         assert track.joints[0].tau.max() == (9.0 if limited else 12.0)
 
 
-def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
+def test_targets_of_joints_are_dashed_lines(tmp_path):
     """Each bag has its own, in view, told, and legible beside limits and efforts; on a page too."""
     fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
     (tmp_path / "in.csv").write_text("time,q_des[1],q_des[2]\n0,0.8,1\n0.2,1.2,-0.1\n")
@@ -202,7 +199,7 @@ def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
     assert "Position in rad; thin dashes: target" in [a["text"] for a in over["layout"]["annotations"]]
 
 
-def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path: Path) -> None:
+def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path):
     fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
     settings = {"friction": (3.0, 0.0), "q_des": (1.4, -0.5), "Kd": (0.0, 1.0), "gravity": (0.0, 0.0, 0.0)}
     recording = record(tmp_path / "bag", fmu, stop_time=1.5, settings=settings)
@@ -217,7 +214,7 @@ def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path: Path) ->
     assert any(label in a["text"] for a in over["layout"]["annotations"])
 
 
-def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
+def test_targets_of_many_joints_are_legible(tmp_path):
     """They stand beside limits with long names, and efforts; their place is named once."""
     fmu = build(tmp_path, chain_urdf("zyx" * 4, 0.1, low=-1.234, high=2.345), control="joint")
     bag, target = twodof.Bag(tmp_path / "bag", effort=True), {"q_des": 0.1}
@@ -227,7 +224,7 @@ def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
     assert "".join(texts(figure)).count("thin dashes: target") == 1
 
 
-def test_a_bag_may_have_the_name_of_a_limit(default: Recording) -> None:
+def test_a_bag_may_have_the_name_of_a_limit(default):
     run = replace(twodof.read_bag(default.bag), path=Path("limit"))
     figure = plot(run)
     curves = [line for line in lines(panels(figure).q[0], "limit") if len(points(line)) > 2]
@@ -237,7 +234,7 @@ def test_a_bag_may_have_the_name_of_a_limit(default: Recording) -> None:
 # --- inputs over time ---
 
 
-def test_changes_are_where_the_master_makes_them(changing: Recording) -> None:
+def test_changes_are_where_the_master_makes_them(changing):
     """Distances by the FMU's own x and the inputs of its samples; the closed form by its x."""
     figure = plot(changing.bag)
     found = panels(figure)
@@ -254,7 +251,7 @@ def test_changes_are_where_the_master_makes_them(changing: Recording) -> None:
     assert told == ("x_des varied, xdd_des varied, Kp varied, Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu, bag bag")
 
 
-def test_a_target_on_a_path_is_drawn_as_a_path(fmu_path: Path, tmp_path: Path) -> None:
+def test_a_target_on_a_path_is_drawn_as_a_path(fmu_path, tmp_path):
     t = np.arange(100) * 0.01
     circle = np.column_stack([0.15 + 0.05 * np.cos(t), 0.1 + 0.05 * np.sin(t)])
     rows = "".join(f"{a},{x!r},{y!r}\n" for a, (x, y) in zip(t.tolist(), circle.tolist()))
@@ -281,9 +278,7 @@ DISTURBED: dict[str, tuple[str, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("urdf", "settings", "label"), DISTURBED.values(), ids=list(DISTURBED))
-def test_the_closed_form_says_what_it_leaves_out(
-    urdf: str, settings: dict[str, Any], label: str, tmp_path: Path
-) -> None:
+def test_the_closed_form_says_what_it_leaves_out(urdf, settings, label, tmp_path):
     fmu = build(tmp_path, urdf, axes="xy", q_start=(0.3, 0.5))
     settings = {"x_des": (0.3, 0.6), **settings}
     recording = record(tmp_path / "bag", fmu, stop_time=0.5, settings=settings)
@@ -297,7 +292,7 @@ def test_the_closed_form_says_what_it_leaves_out(
 
 
 @pytest.mark.parametrize(("joints", "control"), [("z", "task"), ("zz", "pose")])
-def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(joints: str, control: str, tmp_path: Path) -> None:
+def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(joints, control, tmp_path):
     """One joint for two axes; two joints for these and an orientation."""
     start = (0.3, 0.5)[: len(joints)]
     fmu = build(tmp_path, chain_urdf(joints), axes="xy", q_start=start, control=control)
@@ -315,7 +310,7 @@ def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(joints: str, co
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("gains", [(0.0, 40.0), (0.0, 0.0), (50.0, 0.0)])
-def test_a_controller_without_a_gain_is_drawn(gains: tuple[float, float], fmu_path: Path, tmp_path: Path) -> None:
+def test_a_controller_without_a_gain_is_drawn(gains, fmu_path, tmp_path):
     Kp, Kd = gains
     recording = record(
         tmp_path / "bag",
@@ -329,7 +324,7 @@ def test_a_controller_without_a_gain_is_drawn(gains: tuple[float, float], fmu_pa
     np.testing.assert_allclose(only(error, "closed form")[:, 1], distance, rtol=0.0, atol=1e-9)
 
 
-def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: Path) -> None:
+def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path, tmp_path):
     at_rest = oracles.position(np.array([0.5, 0.35]))
     recording = record(tmp_path / "bag", fmu_path, stop_time=0.1, settings={"x_des": tuple(at_rest)})
     figure = plot(recording.bag)
@@ -347,7 +342,7 @@ def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("at", [4321.987, -1e-3])
-def test_ticks_of_what_does_not_move_differ(default: Recording, at: float) -> None:
+def test_ticks_of_what_does_not_move_differ(default, at):
     run = long_run(default, np.full((200, 2), at))
     figure = plot(replace(run, v=run.q, tau=run.q))
     FigureCanvasAgg(figure).draw()
@@ -361,7 +356,7 @@ def test_ticks_of_what_does_not_move_differ(default: Recording, at: float) -> No
 # --- several bags ---
 
 
-def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Recording]) -> None:
+def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains):
     """Each by one look in all panels."""
     figure = plot(*(recording.bag for recording in gains.values()))
     names = ["Kp = 20 s⁻²", "Kp = 50 s⁻²", "Kp = 400 s⁻²"]
@@ -386,7 +381,7 @@ def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Record
     assert words == ["arm at the start", "arm at the end", "path", "target", "reach 0.3 m"]
 
 
-def test_looks_are_different_and_their_colours_those_of_okabe_and_ito() -> None:
+def test_looks_are_different_and_their_colours_those_of_okabe_and_ito():
     """Black, orange, sky blue, bluish green, blue, vermillion and reddish purple, as published."""
     found = [look[1:] for look in line_styles(map(str, range(28)))]
     assert len(set(found)) == 28
@@ -418,7 +413,7 @@ LABELS: dict[str, tuple[list[dict[str, Any]], list[str]]] = {
 
 
 @pytest.mark.parametrize(("runs", "expected"), LABELS.values(), ids=list(LABELS))
-def test_labels_say_what_differs(runs: list[dict[str, Any]], expected: list[str], default: Recording) -> None:
+def test_labels_say_what_differs(runs, expected, default):
     bag = twodof.read_bag(default.bag)
     bags = []
     for run in runs:

@@ -1,7 +1,5 @@
 """Plots in files, windows and notebooks, their legibility, and the command."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -11,7 +9,6 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -22,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
-from recordings import LINK, Recording, chain_urdf, long_run, third_party_bag, waves
+from recordings import LINK, chain_urdf, long_run, third_party_bag, waves
 
 import twodof
 from twodof.cli.main import main
@@ -38,9 +35,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path
 # --- what a reader sees ---
 
 
-def test_figures_are_legible(
-    gains: dict[int, Recording], changing: Recording, foreign: Path, ur5: str, tmp_path: Path
-) -> None:
+def test_figures_are_legible(gains, changing, foreign, ur5, tmp_path):
     (tmp_path / "ur5.urdf").write_text(ur5)
     (tmp_path / "chain.urdf").write_text(chain_urdf("zyX" * 5 + "z", 0.1, low=-3.07, high=2.35))
     names = [f"j{i + 1}" for i in range(16)]
@@ -59,7 +54,7 @@ def test_figures_are_legible(
         assert_legible(figure)
 
 
-def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
+def test_names_are_drawn_as_they_are(tmp_path):
     """A dollar sign would begin a formula."""
     bag = third_party_bag(tmp_path / "a$b$_c^", ["$q$", "x_{1}"], *waves(2))
     figure = plot(bag)
@@ -69,7 +64,7 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     assert not any(text.get_parse_math() for text in named)
 
 
-def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Path) -> None:
+def test_settings_of_the_user_do_not_change_it(default, tmp_path):
     expected = save(drawing(read_tracks([default.bag])), tmp_path / "a.svg").read_bytes()
     with matplotlib.rc_context({"lines.linewidth": 9.0, "axes.grid": False, "font.size": 30, "svg.fonttype": "none"}):
         found = save(drawing(read_tracks([default.bag])), tmp_path / "b.svg").read_bytes()
@@ -80,7 +75,7 @@ def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Pat
     assert max(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) == 11.0
 
 
-def test_notebooks_show_it(default: Recording) -> None:
+def test_notebooks_show_it(default):
     figure = plot(twodof.read_bag(default.bag))
     assert isinstance(figure, Figure) and isinstance(figure, Plot)
     assert figure._repr_png_().startswith(b"\x89PNG")
@@ -89,7 +84,7 @@ def test_notebooks_show_it(default: Recording) -> None:
 # --- long bags ---
 
 
-def test_noise_in_a_long_bag_keeps_its_extremes(default: Recording, tmp_path: Path) -> None:
+def test_noise_in_a_long_bag_keeps_its_extremes(default, tmp_path):
     """In each of 500 pixels across; and files stay small."""
     n = 120_000
     noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))
@@ -116,7 +111,7 @@ def test_noise_in_a_long_bag_keeps_its_extremes(default: Recording, tmp_path: Pa
         assert save(drawing(tracks), tmp_path / f"long.{kind}").stat().st_size < most
 
 
-def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> None:
+def test_a_long_path_keeps_its_corners(default, tmp_path):
     """A square in which the end effector rests long: no corner is cut."""
     corners = np.array([(0.1, 0.1), (0.2, 0.1), (0.2, 0.15), (0.1, 0.15), (0.1, 0.1)])
     side = np.linspace(0.0, 1.0, 1250)[:, None]
@@ -137,7 +132,7 @@ def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> No
 # --- files ---
 
 
-def test_each_kind_of_file_opens(gains: dict[int, Recording], tmp_path: Path) -> None:
+def test_each_kind_of_file_opens(gains, tmp_path):
     tracks = read_tracks([recording.bag for recording in gains.values()])
     png, svg, pdf, page = (save(drawing(tracks), tmp_path / f"a.{k}") for k in ("PNG", "svg", "pdf", "html"))
     with Image.open(png) as image:
@@ -178,7 +173,7 @@ for kind in ("png", "svg", "pdf", "html"):
 """
 
 
-def test_equal_bags_give_equal_files(gains: dict[int, Recording], tmp_path: Path) -> None:
+def test_equal_bags_give_equal_files(gains, tmp_path):
     """In another process, with other hashes, at another time; in which a figure is quick.
 
     That is: nothing is imported for it that takes long.
@@ -199,9 +194,7 @@ def test_equal_bags_give_equal_files(gains: dict[int, Recording], tmp_path: Path
         assert (tmp_path / f"a.{kind}").read_bytes() == here.read_bytes()
 
 
-def test_without_a_name_the_plot_has_that_of_the_bag(
-    gains: dict[int, Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_name_the_plot_has_that_of_the_bag(gains, tmp_path, monkeypatch):
     """A plot of ours is replaced, and nothing else is."""
     monkeypatch.chdir(tmp_path)
     tracks = read_tracks([gains[50].bag])
@@ -221,9 +214,7 @@ def test_without_a_name_the_plot_has_that_of_the_bag(
     assert read_tracks(["."])[0].name == "Kp50"
 
 
-def test_a_file_is_written_whole_or_not_at_all(
-    default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_written_whole_or_not_at_all(default, tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(b"before")
 
     def full(*_: object) -> None:
@@ -274,7 +265,7 @@ for environment, backend in json.loads(sys.argv[2]):
 """
 
 
-def test_a_window_opens_where_there_is_a_display(default: Recording, tmp_path: Path) -> None:
+def test_a_window_opens_where_there_is_a_display(default, tmp_path):
     """An X or a Wayland one; and not by a backend for files, or one that is not there."""
     (tmp_path / "windows.py").write_text(BACKEND.format(framework="test"))
     (tmp_path / "files.py").write_text(BACKEND.format(framework=None))
@@ -301,7 +292,7 @@ def test_a_window_opens_where_there_is_a_display(default: Recording, tmp_path: P
 # --- what is wrong ---
 
 
-def test_what_else_is_wrong_is_named(default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_else_is_wrong_is_named(default, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     drawn = drawing(read_tracks([default.bag]))
     Path("folder.png").mkdir()
@@ -327,7 +318,7 @@ def test_what_else_is_wrong_is_named(default: Recording, tmp_path: Path, monkeyp
     assert file_kind("x/y.HTML") == "html"
 
 
-def test_without_matplotlib_it_says_what_to_install() -> None:
+def test_without_matplotlib_it_says_what_to_install():
     code = "import sys; sys.modules['matplotlib'] = None; import twodof.plots.runs"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, timeout=60)
     last = done.stderr.strip().splitlines()[-1]
@@ -338,7 +329,7 @@ def test_without_matplotlib_it_says_what_to_install() -> None:
 # --- the command ---
 
 
-def test_joints_are_chosen(default: Recording, tmp_path: Path, capsys: Any) -> None:
+def test_joints_are_chosen(default, tmp_path, capsys):
     (track,) = with_joints(read_tracks([default.bag]), ["joint2"])
     assert [joint.name for joint in track.joints] == ["joint2"]
     output = ["-o", str(tmp_path / "a.svg")]
@@ -347,9 +338,7 @@ def test_joints_are_chosen(default: Recording, tmp_path: Path, capsys: Any) -> N
     assert main(["plot", str(default.bag), "--joints", "joint2,joint1", *output]) == 0
 
 
-def test_the_command_says_where_the_plot_is_and_what_came_out(
-    gains: dict[int, Recording], foreign: Path, ur5: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_the_command_says_where_the_plot_is_and_what_came_out(gains, foreign, ur5, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ur5.urdf").write_text(ur5)
     options = ["--urdf", "ur5.urdf", "--frame", "forearm_link"]
@@ -366,9 +355,7 @@ def test_the_command_says_where_the_plot_is_and_what_came_out(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["Kp50.png", "a.svg", "both.html", "ur5.urdf"]
 
 
-def test_the_command_fails_in_one_line(
-    default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_the_command_fails_in_one_line(default, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for arguments, message in (
         (["gone", "-o", "a.jpg"], "'a.jpg': the name of a plot ends in"),  # before bags are read

@@ -1,20 +1,16 @@
 """Interactive pages of runs: the data for plotly, and the page in a browser."""
 
-from __future__ import annotations
-
 import base64
 import re
 import shutil
-from collections.abc import Iterator
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import browser
 import numpy as np
 import plotly.graph_objects
 import pytest
-from recordings import Recording, long_run
+from recordings import long_run
 
 from twodof.plots.figure import save
 from twodof.plots.interactive import in_workspace, over_time
@@ -36,7 +32,7 @@ def traces(figure: dict[str, Any], joint: str, kind: str) -> list[np.ndarray]:
     ]
 
 
-def test_a_page_has_the_curves_of_the_bags(gains: dict[int, Recording]) -> None:
+def test_a_page_has_the_curves_of_the_bags(gains):
     """As plotly itself takes them, which refuses what it does not know."""
     tracks = read_tracks([gains[20].bag, gains[50].bag])
     time, view = over_time(tracks), *in_workspace(tracks)
@@ -52,7 +48,7 @@ def test_a_page_has_the_curves_of_the_bags(gains: dict[int, Recording]) -> None:
         np.testing.assert_allclose(traces(time, "", "error")[i][:, 1], error, atol=1e-15)
 
 
-def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(default: Recording, tmp_path: Path) -> None:
+def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(default, tmp_path):
     """It keeps extremes, and jumps that are none, of one sample, in a curve that swings further."""
     n, jumps = 360_000, np.array([11_113, 130_077, 347_042])
     noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))
@@ -91,7 +87,7 @@ class Links(HTMLParser):
                 self.found.append((tag, str(value)))
 
 
-def test_a_page_needs_no_network(default: Recording, tmp_path: Path) -> None:
+def test_a_page_needs_no_network(default, tmp_path):
     """And names in it are text, whatever they are."""
     bag = tmp_path / "<script src=x> & co"
     shutil.copytree(default.bag, bag)
@@ -114,12 +110,12 @@ SEEN = """() => {
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
+def chromium():
     with browser.chromium() as started:
         yield started
 
 
-def test_a_page_answers(gains: dict[int, Recording], chromium: Any, tmp_path: Path) -> None:
+def test_a_page_answers(gains, chromium, tmp_path):
     """Boxes switch joints and bags in all figures, the cursor tells the values of all panels."""
     tracks = read_tracks([gains[20].bag, gains[50].bag])
     page = save(drawing(tracks), tmp_path / "a.html")
@@ -159,7 +155,7 @@ def test_a_page_answers(gains: dict[int, Recording], chromium: Any, tmp_path: Pa
     assert said == []
 
 
-def test_buttons_of_a_page_cover_no_heading(default: Recording, chromium: Any, tmp_path: Path) -> None:
+def test_buttons_of_a_page_cover_no_heading(default, chromium, tmp_path):
     """Nor on a phone, where they are always shown."""
     page = save(drawing(read_tracks([default.bag])), tmp_path / "a.html")
     phone = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}

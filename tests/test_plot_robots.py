@@ -1,7 +1,5 @@
 """Figures of other robots and of third-party bags, against Pinocchio; refusals."""
 
-from __future__ import annotations
-
 import copy
 import math
 import re
@@ -17,7 +15,7 @@ import pytest
 from figures import heights, legend_of, lines, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from recordings import LINK, UR5_JOINTS, Recording, bare, build, chain_urdf, record, third_party_bag, waves
+from recordings import LINK, UR5_JOINTS, bare, build, chain_urdf, record, third_party_bag, waves
 
 import twodof
 from twodof.bag.provenance import Provenance
@@ -51,7 +49,7 @@ def kinematics(urdf: str, frame: str, names: Sequence[str], q: np.ndarray) -> np
     return np.array(path)
 
 
-def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_path: Path) -> None:
+def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5, tmp_path):
     fmu = build(tmp_path, bare(ur5), frame="tool0", q_start=oracles.REST["ur5"])
     recording = record(tmp_path / "bag", fmu, stop_time=0.3, settings={"x_des": (0.3, 0.35, 0.5)})
     found = panels(plot(recording.bag))
@@ -76,7 +74,7 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_pat
     assert heights(found.q[2], "limit") == pytest.approx([-math.pi, math.pi], rel=1e-3)
 
 
-def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> None:
+def test_a_single_joint_has_its_position_above_its_velocity(tmp_path):
     """The target is a height; across, the end effector may be anywhere."""
     fmu = build(tmp_path, chain_urdf("z"), axes="y", q_start=(-0.3,))
     recording = record(tmp_path / "bag", fmu, stop_time=1.0, settings={"x_des": 0.2})
@@ -96,7 +94,7 @@ def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> N
     np.testing.assert_allclose(only(found.error, "bag")[:, 1], np.abs(height - 0.2), rtol=1e-9, atol=1e-15)
 
 
-def test_joints_that_slide_have_metres(tmp_path: Path) -> None:
+def test_joints_that_slide_have_metres(tmp_path):
     figure = seen(tmp_path, chain_urdf("zX"), ["j1", "j2"], *waves(2))
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad or m"
@@ -117,7 +115,7 @@ PLANES = {
 
 
 @pytest.mark.parametrize(("axes", "expected"), PLANES.items(), ids=list(PLANES))
-def test_motion_in_a_plane_is_seen_in_that_plane(axes: str, expected: tuple[str, float | None], tmp_path: Path) -> None:
+def test_motion_in_a_plane_is_seen_in_that_plane(axes, expected, tmp_path):
     """With the circle that it cannot leave, if all of its joints turn."""
     names = [f"j{i + 1}" for i in range(len(axes))]
     (view,) = panels(seen(tmp_path, chain_urdf(axes), names, *waves(len(axes)))).views
@@ -131,7 +129,7 @@ def test_motion_in_a_plane_is_seen_in_that_plane(axes: str, expected: tuple[str,
         assert farthest <= reach + 1e-12
 
 
-def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path: Path) -> None:
+def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path):
     """Links of 0.24 × 0.32 × 0.1 m whose joints turn about z: it is seen from above alone."""
     urdf = chain_urdf("zz").replace('<origin xyz="0.4 0 0"/>', '<origin xyz="0.24 0.32 0.1"/>')
     above, beside = panels(seen(tmp_path, urdf, ["j1", "j2"], *waves(2))).views
@@ -140,7 +138,7 @@ def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path: Path) -> None
     assert "reach 0.8 m" in legend_of(beside)
 
 
-def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path: Path) -> None:
+def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path):
     urdf = chain_urdf("zz").replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0.1 1"/>', 1)
     figure = seen(tmp_path, urdf, ["j1", "j2"], *waves(2))
     assert len(panels(figure).views) == 2
@@ -148,7 +146,7 @@ def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(16, 0.67, 1.41), (30, 0.67, 1.5)])
-def test_many_joints_fit_on_a_page(count: int, low: float, high: float, tmp_path: Path) -> None:
+def test_many_joints_fit_on_a_page(count, low, high, tmp_path):
     """Sixteen in one column on one of A4, thirty on a screen."""
     names = [f"j{i + 1}" for i in range(count)]
     figure = seen(tmp_path, chain_urdf("zy" * (count // 2), length=0.1), names, *waves(count))
@@ -160,7 +158,7 @@ def test_many_joints_fit_on_a_page(count: int, low: float, high: float, tmp_path
 # --- third-party bags ---
 
 
-def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign: Path) -> None:
+def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign):
     t, q, v = waves(6)
     figure = plot(foreign)
     found = panels(figure)
@@ -174,7 +172,7 @@ def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign: Path) -> None:
     assert "ur5_log" in texts(figure)
 
 
-def test_with_a_urdf_it_has_limits_path_and_arm(foreign: Path, ur5: str, tmp_path: Path) -> None:
+def test_with_a_urdf_it_has_limits_path_and_arm(foreign, ur5, tmp_path):
     (tmp_path / "ur5.urdf").write_text(ur5)
     found = panels(plot(foreign, urdf=tmp_path / "ur5.urdf"))
     assert found.error is None
@@ -188,7 +186,7 @@ def test_with_a_urdf_it_has_limits_path_and_arm(foreign: Path, ur5: str, tmp_pat
     assert found.q[0].get_title("left") == "Position in rad"
 
 
-def test_another_frame_needs_only_the_joints_that_move_it(foreign: Path, ur5: str, tmp_path: Path) -> None:
+def test_another_frame_needs_only_the_joints_that_move_it(foreign, ur5, tmp_path):
     t, q, v = waves(6)
     names = UR5_JOINTS[:4]  # those up to the forearm and one more
     figure = seen(tmp_path, ur5, names, t, q[:, :4], v[:, :4], frame="forearm_link")
@@ -197,7 +195,7 @@ def test_another_frame_needs_only_the_joints_that_move_it(foreign: Path, ur5: st
     np.testing.assert_allclose(only(view, "path"), path[:, :2], rtol=0.0, atol=1e-12)
 
 
-def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots: Path, tmp_path: Path) -> None:
+def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots, tmp_path):
     """The Panda as it is: a finger mimics the other; and here its links have no masses."""
     urdf = bare((robots / "panda_description/urdf/panda.urdf").read_text())
     massless = re.sub("<inertial>.*?</inertial>", "", urdf, flags=re.S)
@@ -210,7 +208,7 @@ def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots: Path, tmp_path: Pa
     np.testing.assert_allclose(only(panels(figure).views[0], "path"), path[:, :2], rtol=0.0, atol=1e-12)
 
 
-def test_bags_without_velocities_or_with_gaps(tmp_path: Path) -> None:
+def test_bags_without_velocities_or_with_gaps(tmp_path):
     t, q, _ = waves(2, 50)
     q[10:20, 0] = math.nan
     q[:, 1] = math.nan
@@ -223,7 +221,7 @@ def test_bags_without_velocities_or_with_gaps(tmp_path: Path) -> None:
     FigureCanvasAgg(figure).draw()
 
 
-def test_a_bag_of_one_sample_is_a_point(foreign: Path, ur5: str, tmp_path: Path) -> None:
+def test_a_bag_of_one_sample_is_a_point(foreign, ur5, tmp_path):
     t, q, v = waves(6, 2)
     figure = seen(tmp_path, ur5, UR5_JOINTS, t[:1], q[:1], v[:1])
     (line,) = lines(panels(figure).q[0], "bag")
@@ -231,7 +229,7 @@ def test_a_bag_of_one_sample_is_a_point(foreign: Path, ur5: str, tmp_path: Path)
     FigureCanvasAgg(figure).draw()
 
 
-def test_a_urdf_may_replace_that_of_the_bag(default: Recording, tmp_path: Path) -> None:
+def test_a_urdf_may_replace_that_of_the_bag(default, tmp_path):
     """Longer links, as after a calibration; limits and target remain those of the run."""
     urdf = ARM.read_text()
     longer = urdf.replace('<origin xyz="0.15 0 0"', '<origin xyz="0.3 0 0"')
@@ -245,7 +243,7 @@ def test_a_urdf_may_replace_that_of_the_bag(default: Recording, tmp_path: Path) 
     np.testing.assert_allclose(only(found.error, "Kp50")[:, 1], distance, rtol=1e-12)
 
 
-def test_a_xacro_file_may_be_the_robot_of_a_bag(default: Recording, tmp_path: Path) -> None:
+def test_a_xacro_file_may_be_the_robot_of_a_bag(default, tmp_path):
     """Expanded as it is where an FMU is built of it."""
     urdf = ARM.read_text()
     named = urdf.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
@@ -259,14 +257,14 @@ def test_a_xacro_file_may_be_the_robot_of_a_bag(default: Recording, tmp_path: Pa
     assert b"${length}" not in page
 
 
-def test_for_another_frame_there_is_no_target(default: Recording) -> None:
+def test_for_another_frame_there_is_no_target(default):
     found = panels(plot(default.bag, frame="link2"))
     assert found.error is None
     elbow = LINK * np.column_stack([np.cos(default.q[:, 0]), np.sin(default.q[:, 0])])
     np.testing.assert_allclose(only(found.views[0], "path"), elbow, rtol=0.0, atol=1e-14)
 
 
-def test_a_recovered_bag_with_a_gap(default: Recording) -> None:
+def test_a_recovered_bag_with_a_gap(default):
     """Samples 100 to 199 are lost: the rest is where it was."""
     run = twodof.read_bag(default.bag)
     kept = np.r_[0:100, 200:501]
@@ -301,9 +299,7 @@ BAD: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("urdf", "options", "message"), BAD.values(), ids=list(BAD))
-def test_a_urdf_that_is_wrong_is_named(
-    urdf: str | bytes, options: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_a_urdf_that_is_wrong_is_named(urdf, options, message, tmp_path):
     path = tmp_path / "u.urdf"
     path.write_bytes(urdf if isinstance(urdf, bytes) else urdf.encode())
     bag = third_party_bag(tmp_path / "bag", ["j1", "j2"], *waves(2))
@@ -313,7 +309,7 @@ def test_a_urdf_that_is_wrong_is_named(
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_joint_at_infinity_is_nowhere(tmp_path: Path) -> None:
+def test_a_joint_at_infinity_is_nowhere(tmp_path):
     """It turns, slides or is followed: a gap in the path and on the replay, no warning."""
     (tmp_path / "arm.urdf").write_text(chain_urdf("zXy"))
     t, q, v = waves(3)
@@ -348,9 +344,7 @@ UNSOUND: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("spoil", UNSOUND.values(), ids=list(UNSOUND))
-def test_a_bag_whose_provenance_makes_no_sense_is_refused(
-    spoil: Callable[[dict[str, Any]], Any], default: Recording
-) -> None:
+def test_a_bag_whose_provenance_makes_no_sense_is_refused(spoil, default):
     run = twodof.read_bag(default.bag)
     provenance = copy.deepcopy(run.provenance)
     spoil(cast(dict[str, Any], provenance))
@@ -358,7 +352,7 @@ def test_a_bag_whose_provenance_makes_no_sense_is_refused(
         plot(replace(run, provenance=provenance))
 
 
-def test_a_bag_whose_robot_makes_no_sense_is_refused(default: Recording) -> None:
+def test_a_bag_whose_robot_makes_no_sense_is_refused(default):
     run = twodof.read_bag(default.bag)
     for spoilt, message in (
         ({"urdf": "<robot/>"}, "the URDF in '.*Kp50': "),

@@ -1,7 +1,5 @@
 """The bag of a run records all of its inputs; distance and closed form follow from them alone."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import math
@@ -29,11 +27,10 @@ import twodof
 from twodof.bag.provenance import MAX_TAIL
 from twodof.pages.loop import Loop
 from twodof.plots.track import read_tracks
-from twodof.simulation.experiments import Experiment
 
 
 @pytest.fixture(scope="module")
-def run(native_path: Path) -> Experiment:
+def run(native_path):
     return twodof.experiment(native_path)
 
 
@@ -128,9 +125,7 @@ WAYS = [by_settings, by_csv, by_steering, by_sending, by_a_thinned_loop, by_the_
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_the_distance_shown_is_that_of_the_samples(
-    way: Callable[[Path, Path, Collector], None], native_path: Path, tmp_path: Path
-) -> None:
+def test_the_distance_shown_is_that_of_the_samples(way, native_path, tmp_path):
     samples = Collector()
     way(native_path, tmp_path / "bag", samples)
     (track,) = read_tracks([tmp_path / "bag"])
@@ -165,7 +160,7 @@ def stored_changes(bag: Path) -> int:
     return len(json.loads((bag / "run.json").read_text())["input_changes"])
 
 
-def test_so_it_is_after_a_kill_up_to_the_last_flush(native_path: Path, tmp_path: Path) -> None:
+def test_so_it_is_after_a_kill_up_to_the_last_flush(native_path, tmp_path):
     bag = tmp_path / "bag"
     command = [sys.executable, "-c", LOOP, str(native_path), str(bag)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
@@ -180,7 +175,7 @@ def test_so_it_is_after_a_kill_up_to_the_last_flush(native_path: Path, tmp_path:
     assert len(track.recording.provenance["input_changes"]) >= len(track.t) - 1
 
 
-def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(native_path: Path, tmp_path: Path) -> None:
+def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(native_path, tmp_path):
     """In a bag whose run.json was lost, and where there were more changes than it has room for."""
     samples = Collector()
     run = twodof.experiment(native_path, stop_time=STEPS / 100)
@@ -217,7 +212,7 @@ def _renamed_root(urdf: Path) -> Path:
     return other
 
 
-def test_what_is_not_known_is_not_shown(native_path: Path, tmp_path: Path) -> None:
+def test_what_is_not_known_is_not_shown(native_path, tmp_path):
     """The file of the changes was full: no distance is shown after its end."""
     bag = tmp_path / "bag"
     by_sending(native_path, bag, Collector())
@@ -232,7 +227,7 @@ def test_what_is_not_known_is_not_shown(native_path: Path, tmp_path: Path) -> No
 
 
 @both_storages
-def test_provenance_is_complete(native_path: Path, tmp_path: Path, storage: str) -> None:
+def test_provenance_is_complete(native_path, tmp_path, storage):
     inputs = tmp_path / "inputs.csv"
     inputs.write_text("time,x_des[1],x_des[2]\n0.02,0.25,0.1\n0.05,0.2,0.05\n")
     run = twodof.experiment(native_path, stop_time=0.1, step=0.005, settings={"Kp": 80.0}, input_file=inputs)
@@ -278,9 +273,7 @@ CHANGES = [[0.02, {"x_des[1]": 0.1, "x_des[2]": 0.2}], [0.04, {"Kp[2]": 80.0}]]
 
 
 @both_storages
-def test_provenance_has_each_change_of_an_input_that_a_loop_sends(
-    native_path: Path, tmp_path: Path, storage: str
-) -> None:
+def test_provenance_has_each_change_of_an_input_that_a_loop_sends(native_path, tmp_path, storage):
     """The bag has every third sample."""
     run = twodof.experiment(native_path, stop_time=math.inf)
     steps = twodof.samples(run)
@@ -295,7 +288,7 @@ def test_provenance_has_each_change_of_an_input_that_a_loop_sends(
     assert provenance["input_changes"] == CHANGES
 
 
-def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(native_path: Path, tmp_path: Path) -> None:
+def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(native_path, tmp_path):
     """At each flush, so that they survive the death of the process."""
     run = twodof.experiment(native_path, stop_time=math.inf)
     steps = twodof.samples(run)
@@ -314,7 +307,7 @@ def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(native_
     )
 
 
-def test_provenance_says_where_it_was_full(run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_provenance_says_where_it_was_full(run, tmp_path, monkeypatch):
     monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", MAX_TAIL + 20_000)
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(1000):
@@ -330,7 +323,7 @@ def test_provenance_says_where_it_was_full(run: Experiment, tmp_path: Path, monk
     assert provenance["inputs_known_until"] == round(changes[-1][0] * 100 + 1) / 100
 
 
-def test_changes_beyond_what_a_reader_holds_are_not_known(run: Experiment, tmp_path: Path) -> None:
+def test_changes_beyond_what_a_reader_holds_are_not_known(run, tmp_path):
     """Each of 4000 inputs changes once: together 8 million values in effect, of a file of 100 kB."""
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(5):
@@ -345,7 +338,7 @@ def test_changes_beyond_what_a_reader_holds_are_not_known(run: Experiment, tmp_p
     assert read["inputs_known_until"] == known / 1e5
 
 
-def test_custom_data_leaves_out_changes_that_take_yaml_minutes(run: Experiment, tmp_path: Path) -> None:
+def test_custom_data_leaves_out_changes_that_take_yaml_minutes(run, tmp_path):
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(20_000):
             inputs = {"x_des[1]": k / 7}
@@ -355,7 +348,7 @@ def test_custom_data_leaves_out_changes_that_take_yaml_minutes(run: Experiment, 
     assert len(twodof.read_bag(tmp_path / "bag").provenance["input_changes"]) == 20_000
 
 
-def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run: Experiment, tmp_path: Path) -> None:
+def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run, tmp_path):
     damaged = []
     for n in range(0, 80, 7):
         path = tmp_path / f"bag{n}"
@@ -371,7 +364,7 @@ def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run: Exper
     assert damaged == []
 
 
-def test_provenance_is_there_before_the_first_message(run: Experiment, tmp_path: Path) -> None:
+def test_provenance_is_there_before_the_first_message(run, tmp_path):
     file = tmp_path / "bag" / "run.json"
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         before = file.read_bytes()

@@ -4,15 +4,12 @@ Truth is the bag that is recorded at the same time, read by the MCAP project's r
 the loopback interface, or in network namespaces that lead nowhere.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +17,7 @@ import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
 from harness import wait_until
-from nodes import CABLE, COMMANDS, LATCHED, STREAMS, Node, ended, environment, isolated, published, recorded, stamp_of
+from nodes import CABLE, COMMANDS, LATCHED, STREAMS, ended, environment, isolated, published, recorded, stamp_of
 
 import twodof
 from twodof.cli.main import main
@@ -46,9 +43,7 @@ TYPES = dict(
 )
 
 
-def test_another_makers_dds_hears_every_field_of_the_bag(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
-) -> None:
+def test_another_makers_dds_hears_every_field_of_the_bag(native_path, tmp_path, number, listen, length):
     """Under the names, types and type hashes of ROS 2, stamped by the wall clock."""
     seconds, before = length(60, 2), 4  # in which a busy machine finds the node
     node = listen(*STREAMS, *LATCHED)
@@ -81,8 +76,8 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
 
 
 def test_who_comes_late_gets_what_is_latched_and_the_last_sample_before_a_signal(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
-) -> None:
+    native_path, tmp_path, number, listen, length
+):
     bag = tmp_path / "bag"
     with published(number, native_path, "--scene", "-o", str(bag)) as process:
         time.sleep(length(45, 1))
@@ -104,9 +99,7 @@ def test_who_comes_late_gets_what_is_latched_and_the_last_sample_before_a_signal
     assert "stopped" in out and f"{len(states)} messages" in out
 
 
-def test_a_point_is_the_target_within_two_steps(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_a_point_is_the_target_within_two_steps(native_path, tmp_path, number, listen):
     bag, step = tmp_path / "bag", 0.2  # long: what the machine does beside this is not tested
     points = {(0.125, 0.17): "world", (0.13, 0.16): "", (0.14, 0.15): "world", (0.15, 0.14): ""}
     node = listen("/target", *COMMANDS)
@@ -141,9 +134,7 @@ def test_a_point_is_the_target_within_two_steps(
             sample = run.send(told.get(sample.k))
 
 
-def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(native_path, tmp_path, number, listen):
     """The robot is stopped, and follows the next target that it can; one warning a kind."""
     node = listen("/joint_states", "/target", *COMMANDS)
     options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
@@ -187,9 +178,7 @@ def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
     np.testing.assert_allclose(track.task.error, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(native_path, tmp_path, number, listen):
     bag = tmp_path / "bag"
     with published(number, native_path, "--scene", "-o", str(bag)) as process:
         stalled, killed = listen(*STREAMS, *LATCHED), listen(*STREAMS)
@@ -210,9 +199,7 @@ def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
     assert re.search(rf"\d+ of {len(stamps)} missed", out)
 
 
-def test_two_publishers_on_one_topic_are_both_heard(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_two_publishers_on_one_topic_are_both_heard(native_path, tmp_path, number, listen):
     node = listen("/joint_states")
     bags = [tmp_path / "one", tmp_path / "two"]
     runs = [["--stop-time", "4", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
@@ -229,7 +216,7 @@ def test_two_publishers_on_one_topic_are_both_heard(
         assert len(mine) > 100 and mine == truth[-len(mine) :]
 
 
-def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, number: int) -> None:
+def test_without_a_network_the_run_goes_on(native_path, tmp_path, number):
     bag = tmp_path / "bag"
     options = ["--stop-time", "0.5", "-o", str(bag)]
     inside = isolated("true")
@@ -264,16 +251,7 @@ def packets(process: subprocess.Popen[str]) -> int:
         ),
     ],
 )
-def test_range(
-    native_path: Path,
-    number: int,
-    listen: Callable[..., Node],
-    options: list[str],
-    variables: dict[str, str],
-    reach: str,
-    local: bool,
-    outside: bool,
-) -> None:
+def test_range(native_path, number, listen, options, variables, reach, local, outside):
     """A node of ROS 2's default range hears the run, and packets leave the host, or not."""
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     inside = isolated(CABLE)
@@ -324,7 +302,7 @@ SHELLS = (  # of its ranges LOCALHOST and SUBNET
 
 
 @pytest.mark.parametrize("variables", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}])
-def test_cyclone_dds_as_jazzy_configures_it_hears(native_path: Path, number: int, variables: dict[str, str]) -> None:
+def test_cyclone_dds_as_jazzy_configures_it_hears(native_path, number, variables):
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     with published(number, native_path, inside=isolated(CABLE), **variables) as process:
         enter = ["nsenter", "--net", "--target", str(process.pid)]
@@ -333,7 +311,7 @@ def test_cyclone_dds_as_jazzy_configures_it_hears(native_path: Path, number: int
         assert min(int(shell.communicate()[0]) for shell in shells) >= 50
 
 
-def test_an_interface_can_be_chosen(native_path: Path, number: int) -> None:
+def test_an_interface_can_be_chosen(native_path, number):
     chosen = (
         "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='cable0'/></Interfaces>"
         "</General></Domain></CycloneDDS>"
@@ -345,9 +323,7 @@ def test_an_interface_can_be_chosen(native_path: Path, number: int) -> None:
         assert ended(process, 130)[1] == ""
 
 
-def test_an_interface_that_goes_and_comes_back(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_an_interface_that_goes_and_comes_back(native_path, tmp_path, number, listen):
     bag = tmp_path / "bag"
     options, inside = ["-o", str(bag)], isolated(CABLE)
     with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
@@ -383,9 +359,7 @@ print(memory.growth)
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_an_hour_has_flat_memory(
-    native_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
-) -> None:
+def test_an_hour_has_flat_memory(native_path, number, listen, length):
     """Seconds without pace; in full, an hour in real time."""
     steps = length(360_000, 5_000)
     listen("/joint_states", "/tf", "/robot_description")
@@ -414,7 +388,7 @@ def test_an_hour_has_flat_memory(
         ({"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, Network(loopback=True)),
     ],
 )
-def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> None:
+def test_the_environment_of_ros_2(variables, place):
     assert network_of_environment(variables) == place
 
 
@@ -445,13 +419,7 @@ def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> 
         ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
     ],
 )
-def test_a_network_that_cannot_be(
-    native_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    variables: dict[str, str],
-    culprit: str,
-) -> None:
+def test_a_network_that_cannot_be(native_path, monkeypatch, capfd, variables, culprit):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert main(["publish", str(native_path), "--stop-time", "0.1"]) == 1
@@ -459,7 +427,7 @@ def test_a_network_that_cannot_be(
     assert re.match(f"twodof: error: .*{culprit}", line), line
 
 
-def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
+def test_without_cyclone_dds_it_says_what_to_install(native_path):
     missing = "import sys; sys.modules['cyclonedds'] = None; "
     code = missing + "from twodof.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "publish", str(native_path)]
@@ -469,15 +437,13 @@ def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
     assert "install the extra 'ros': " in line
 
 
-def test_options_beside_an_experiment_are_refused(native_path: Path) -> None:
+def test_options_beside_an_experiment_are_refused(native_path):
     run = twodof.experiment(native_path, stop_time=0.02)
     with pytest.raises(InputError, match="stop_time would have no effect with an experiment"):
         twodof.publish(run, stop_time=1.0)
 
 
-def test_a_publisher_tells_each_run_what_holds_for_it(
-    native_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_a_publisher_tells_each_run_what_holds_for_it(native_path, number, listen):
     """Also the second, whose robot may be another."""
     publisher = twodof.Publisher(network_of_environment(environment(number)), scene=True)
     run = twodof.experiment(native_path, stop_time=0.02)
@@ -491,9 +457,7 @@ def test_a_publisher_tells_each_run_what_holds_for_it(
     node.until(heard)
 
 
-def test_robots_whose_fmus_would_be_one_file_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_robots_whose_fmus_would_be_one_file_are_refused(tmp_path, monkeypatch, capsys):
     """The second was run as both, under the name of the first."""
     monkeypatch.chdir(tmp_path)
     shipped = data_file("urdf", "2dof.urdf").read_text()
@@ -508,7 +472,7 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(
     assert told in capsys.readouterr().err
 
 
-def test_a_robots_name_is_told_as_it_was_given(native_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robots_name_is_told_as_it_was_given(native_path, capsys):
     assert main(["publish", f"1={native_path}", "--stop-time", "0.01"]) == 1
     assert "NAME=FMU '1' is not a valid ROS 2 name" in capsys.readouterr().err
     run = twodof.experiment(native_path, stop_time=0.1)

@@ -1,15 +1,12 @@
 """The hosts and nodes that can command a published run: two network namespaces, and two controllers."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 from harness import wait_until
@@ -87,14 +84,8 @@ def other_host(process: subprocess.Popen[str]) -> Iterator[int]:
     ],
 )
 def test_other_hosts_are_obeyed_where_it_says_so_alone(
-    native_path: Path,
-    tmp_path: Path,
-    number: int,
-    options: list[str],
-    variables: dict[str, str],
-    said: str,
-    open_to: bool,
-) -> None:
+    native_path, tmp_path, number, options, variables, said, open_to
+):
     """One that announces itself to each of the run's ports, listens and commands."""
     bag, inside = tmp_path / "bag", isolated(CABLE)
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
@@ -111,9 +102,7 @@ def test_other_hosts_are_obeyed_where_it_says_so_alone(
     assert bool(provenance["input_changes"]) == ("commanders" in provenance) == open_to
 
 
-def test_nodes_that_command_are_recorded_and_two_at_once_reported(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
+def test_nodes_that_command_are_recorded_and_two_at_once_reported(native_path, tmp_path, number, listen):
     """Each once, by what DDS tells of its participant."""
     bag = tmp_path / "bag"
     one, two = listen("/target_command"), listen("/target_command")

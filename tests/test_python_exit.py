@@ -1,7 +1,5 @@
 """A process that has run the Python FMU ends without use of freed memory, in FMPy and from C."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -42,7 +40,7 @@ def original() -> bytes:
 
 
 @pytest.fixture
-def unzipped(fmu_path: Path, tmp_path: Path) -> Path:
+def unzipped(fmu_path, tmp_path):
     with zipfile.ZipFile(fmu_path) as archive:
         archive.extractall(tmp_path / "unzipped")
     return tmp_path / "unzipped"

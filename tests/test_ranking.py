@@ -1,12 +1,9 @@
 """Errors and exceeded limits of a run, and the ranking of a sweep's runs."""
 
-from __future__ import annotations
-
 import json
 import math
 import xml.etree.ElementTree as ET
 from math import inf, nan
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ GOAL = (0.9, 0.1, 0.3, 0.2)
 
 
 @pytest.fixture(scope="module")
-def ur5(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def ur5(tmp_path_factory):
     """By its control."""
     folder = tmp_path_factory.mktemp("ur5")
     return {
@@ -62,7 +59,7 @@ class Kept(twodof.Sink):
 
 
 @pytest.mark.parametrize("count", [3, 5000])
-def test_a_summary_has_the_errors_of_all_that_is_controlled(ur5: dict[str, Path], count: int) -> None:
+def test_a_summary_has_the_errors_of_all_that_is_controlled(ur5, count):
     kept = Kept()
     settings = {"quat_des": GOAL, "Kp": 400.0, "Kp_rot": 400.0}
     run = twodof.simulate(ur5["pose"], kept, settings=settings, step=0.002, stop_time=0.002 * count)
@@ -80,7 +77,7 @@ def test_a_summary_has_the_errors_of_all_that_is_controlled(ur5: dict[str, Path]
     assert shares == sorted(shares, reverse=True)
 
 
-def test_a_run_of_joints_has_the_largest_error_and_saturation_is_within_limits(ur5: dict[str, Path]) -> None:
+def test_a_run_of_joints_has_the_largest_error_and_saturation_is_within_limits(ur5):
     goal = (0.3, -1.0, 1.2, 0.9, -0.8, 0.3)
     settings = {"q_des": goal, "Kp": 60.0, "Kd": 10.0, "limit_effort": True}
     run = twodof.simulate(ur5["joint"], settings=settings, stop_time=0.1)
@@ -89,9 +86,7 @@ def test_a_run_of_joints_has_the_largest_error_and_saturation_is_within_limits(u
     assert not [cause for cause in run.verdict.causes if cause.kind == "effort"]
 
 
-def test_a_run_prints_all_of_its_errors_and_limits(
-    ur5: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_prints_all_of_its_errors_and_limits(ur5, tmp_path, capsys):
     sets = ["--set", "quat_des=0.9,0.1,0.3,0.2", "--set", "Kp_rot=400", "--stop-time", "0.3"]
     bag = str(tmp_path / "bag")
     assert main(["run", str(ur5["pose"]), "-o", bag, "--effort", *sets]) == 0
@@ -110,7 +105,7 @@ def test_a_run_prints_all_of_its_errors_and_limits(
     assert "reached: joints at most 0 rad from their targets, " in capsys.readouterr().out
 
 
-def test_metrics_of_a_pose_are_those_of_its_samples(ur5: dict[str, Path], tmp_path: Path) -> None:
+def test_metrics_of_a_pose_are_those_of_its_samples(ur5, tmp_path):
     settings = {
         "quat_des": tuple(2.0 * np.array(GOAL)),
         "x_des": (0.4, 0.2, 0.5),
@@ -138,7 +133,7 @@ def test_metrics_of_a_pose_are_those_of_its_samples(ur5: dict[str, Path], tmp_pa
     assert table["settling_time"].isna().tolist() == [True, False, False]
 
 
-def test_joint_control_settles_too(ur5: dict[str, Path]) -> None:
+def test_joint_control_settles_too(ur5):
     """Each joint as e'' + Kd e' + Kp e = 0, critically damped: e = e0 (1 + 5 t) exp(-5 t)."""
     settings = {"q_des": (0.3, -1.0, 1.2, 0.4, -0.8, 0.5), "Kd": 10.0}
     (row,) = twodof.sweep(ur5["joint"], grid={"Kp": [25.0]}, settings=settings).to_dict("records")
@@ -149,9 +144,7 @@ def test_joint_control_settles_too(ur5: dict[str, Path]) -> None:
     assert row["overshoot"] == 0.0 and np.isnan(row["final_error"])
 
 
-def test_no_run_beyond_the_limits_is_best(
-    ur5: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_run_beyond_the_limits_is_best(ur5, tmp_path, capsys):
     arguments = ["--set", "q_des=0.3,-1.0,1.2,0.4,-0.8,0.5", "--set", "Kd=20", "--json"]
     folder = str(tmp_path / "some")
     assert main(["sweep", str(ur5["joint"]), "--grid", "Kp=20:4000:5", "-o", folder, *arguments]) == 0
@@ -172,9 +165,7 @@ def test_no_run_beyond_the_limits_is_best(
     assert said in capsys.readouterr().out
 
 
-def test_what_rounding_tells_apart_is_equal(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_rounding_tells_apart_is_equal(native_path, tmp_path, capsys):
     """The tolerance's last bits change nothing: no run of these is better than another."""
     grid = ["--grid", "rcond=0.001:0.002:3", "--stop-time", "0.3", "-o", str(tmp_path / "s")]
     assert main(["sweep", str(native_path), *grid]) == 0
@@ -194,13 +185,13 @@ def test_what_rounding_tells_apart_is_equal(
         ((0.0, 0.9e-12, 1.8e-12, 2.7e-12), (0, 0, 1, 1)),
     ],
 )
-def test_places_are_those_of_the_values(values: tuple[float, ...], expected: tuple[int, ...]) -> None:
+def test_places_are_those_of_the_values(values, expected):
     assert tuple(ranks(np.array(values))) == expected
     shuffled = np.random.default_rng(1).permutation(len(values))
     assert tuple(ranks(np.array(values)[shuffled])) == tuple(np.array(expected, int)[shuffled])
 
 
-def test_a_cost_ranks_the_runs(native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cost_ranks_the_runs(native_path, tmp_path, capsys):
     """Against pandas' own expressions."""
     folder, cost = str(tmp_path / "s"), "settling + 0.1*peak_effort"
     grid = ["--grid", "Kp=20:200:4", "--grid", "Kd=10:30:2", "--stop-time", "2"]
@@ -228,9 +219,7 @@ def best_of(folder: str, cost: str, capsys: pytest.CaptureFixture[str]) -> list[
 
 
 @pytest.mark.parametrize("cost", ["turn_error", "peak_effort/0"])
-def test_a_cost_that_no_run_has_ranks_none(
-    cost: str, native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cost_that_no_run_has_ranks_none(cost, native_path, tmp_path, capsys):
     folder = str(tmp_path / "s")
     grid = ["--grid", "Kp=20:40:2", "--stop-time", "0.1"]
     assert main(["sweep", str(native_path), *grid, "-o", folder, "--cost", cost]) == 0
@@ -250,9 +239,7 @@ def test_a_cost_that_no_run_has_ranks_none(
         ("1/0", "'1/0' has no number of a run; there are: settling_time, overshoot, "),
     ],
 )
-def test_a_cost_is_refused_before_the_sweep(
-    cost: str, said: str, native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cost_is_refused_before_the_sweep(cost, said, native_path, tmp_path, capsys):
     folder = tmp_path / "s"
     assert main(["sweep", str(native_path), "--grid", "Kp=20:40:2", "-o", str(folder), "--cost", cost]) == 1
     assert said in capsys.readouterr().err and not folder.exists()

@@ -4,8 +4,6 @@ MCAP files are made record by record after the specification. What they may cost
 is tested in test_hostile_bags.py.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 import tracemalloc
@@ -39,7 +37,6 @@ from bags import (
 import twodof
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
-from twodof.bag.recording import Recording
 from twodof.bag.records import DamageError, ReadBudget
 from twodof.cli.main import main
 
@@ -78,7 +75,7 @@ def refused(capsys: pytest.CaptureFixture[str], bag: Path) -> str:
 
 
 @pytest.fixture
-def bag(tmp_path: Path) -> Path:
+def bag(tmp_path):
     """The folder of a bag without its messages."""
     bag = tmp_path / "bag"
     bag.mkdir()
@@ -87,12 +84,12 @@ def bag(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("content", MCAPS.values(), ids=MCAPS)
-def test_hostile_mcap_is_refused(bag: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hostile_mcap_is_refused(bag, content, capsys):
     (bag / "bag.mcap").write_bytes(content)
     refused(capsys, bag)
 
 
-def test_mcap_of_more_topics_than_are_read_is_refused(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mcap_of_more_topics_than_are_read_is_refused(bag, capsys):
     topics = b"".join(channel(i, f"/t{i}") for i in range(2, 1002))
     (bag / "bag.mcap").write_bytes(TOPIC + topics + FOOTER)
     assert "has more than 1000 topics" in refused(capsys, bag)
@@ -162,7 +159,7 @@ DATABASES = {
 
 
 @pytest.mark.parametrize(("script", "reason"), DATABASES.values(), ids=DATABASES)
-def test_hostile_database_is_refused(bag: Path, script: str, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hostile_database_is_refused(bag, script, reason, capsys):
     """A database as rosbag2 writes it, changed by some statements."""
     with sqlite3.connect(bag / "bag.db3") as database:
         database.executescript(
@@ -178,7 +175,7 @@ def test_hostile_database_is_refused(bag: Path, script: str, reason: str, capsys
 # --- small files of much ---
 
 
-def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
     """One file alone has it in its metadata, which a folder has in run.json."""
     content = '{"format":1,"fmu":{}}' + " " * 32 * 1024**2
     entries = texts("run.json", content)
@@ -189,7 +186,7 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path: Path, capsy
     assert "has metadata 'twodof' of 335" in capsys.readouterr().err
 
 
-def test_mcap_of_records_that_are_all_alike_is_not_read_to_its_end(bag: Path) -> None:
+def test_mcap_of_records_that_are_all_alike_is_not_read_to_its_end(bag):
     """Each of its chunks is a million empty messages, packed into 3 kB."""
     million = message(b"") * 1_000_000
     packed = chunk(zstandard.compress(million), len(million), "zstd")
@@ -219,7 +216,7 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize(("what", "compression"), [("an arm", "lz4"), ("a humanoid", "zstd"), ("a heartbeat", "zstd")])
-def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path: Path, what: str, compression: str) -> None:
+def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path, what, compression):
     """At the best level, in chunks of 4 MiB, without the index that tools write between them.
 
     That is as small as it gets; each of its chunks pays for itself, so a day of them does.
@@ -234,7 +231,7 @@ def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path: Path, what: str
 
 
 @pytest.mark.parametrize("read", [read_bag, read_ends])
-def test_memory_is_that_of_the_numbers(bag: Path, read: Callable[[Path], Recording | tuple[Recording, int]]) -> None:
+def test_memory_is_that_of_the_numbers(bag, read):
     n = 60_000
     (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) * n + FOOTER)
     tracemalloc.start()
@@ -259,9 +256,7 @@ PROVENANCES = {
 
 
 @pytest.mark.parametrize("content", PROVENANCES.values(), ids=PROVENANCES)
-def test_hostile_provenance_is_refused(
-    native_path: Path, tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_hostile_provenance_is_refused(native_path, tmp_path, content, capsys):
     bag = tmp_path / "bag"
     run = twodof.experiment(native_path)
     with twodof.Bag(bag).begin(run) as sink:

@@ -1,7 +1,5 @@
 """Bags whose writer died: the messages that are saved, and the recovered bag."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random
@@ -12,7 +10,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,13 +48,12 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError
-from twodof.simulation.experiments import Experiment
 
 PAGE = 4096  # bytes, of SQLite
 
 
 @pytest.fixture(scope="module")
-def run(native_path: Path) -> Experiment:
+def run(native_path):
     return twodof.experiment(native_path)
 
 
@@ -78,9 +74,7 @@ def streamed(file: Path) -> int:
 
 @pytest.mark.long
 @both_storages
-def test_killed_run_loses_a_second_at_most(
-    native_path: Path, tmp_path: Path, storage: str, length: Callable[[int, int], int]
-) -> None:
+def test_killed_run_loses_a_second_at_most(native_path, tmp_path, storage, length):
     """The bag has the time in which the run was recorded."""
     options = ["--stamp-start", str(START), "--storage", storage]
     undisturbed = tmp_path / "undisturbed"
@@ -110,7 +104,7 @@ def test_killed_run_loses_a_second_at_most(
 # --- what was lost is the end alone ---
 
 
-def test_mcap_cut_anywhere_keeps_what_came_before(run: Experiment, tmp_path: Path) -> None:
+def test_mcap_cut_anywhere_keeps_what_came_before(run, tmp_path):
     bag = unfinished(tmp_path, run, "mcap", 200, scene=True)
     whole = (bag / "bag.mcap").read_bytes()
     everything = [joint_state(k, sample(run, k)) for k in range(200)]
@@ -134,7 +128,7 @@ def test_mcap_cut_anywhere_keeps_what_came_before(run: Experiment, tmp_path: Pat
     assert max(counts) > 150 and len(counts) > 3
 
 
-def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run: Experiment, tmp_path: Path) -> None:
+def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run, tmp_path):
     bag = unfinished(tmp_path, run, "mcap", 200)
     file = bag / "bag.mcap"
     there = streamed(file)
@@ -145,7 +139,7 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run: Experiment, t
 
 
 @pytest.mark.parametrize("part", [0.95, 0.5])
-def test_sqlite3_file_without_its_end_keeps_what_comes_before(run: Experiment, tmp_path: Path, part: float) -> None:
+def test_sqlite3_file_without_its_end_keeps_what_comes_before(run, tmp_path, part):
     """The kept part is what SQLite itself reads once its header has the right number of pages."""
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
@@ -168,7 +162,7 @@ def test_sqlite3_file_without_its_end_keeps_what_comes_before(run: Experiment, t
 
 
 @pytest.mark.parametrize("table", ["messages", "topics", "message_definitions"])
-def test_a_table_whose_columns_are_damaged_is_not_an_empty_one(run: Experiment, tmp_path: Path, table: str) -> None:
+def test_a_table_whose_columns_are_damaged_is_not_an_empty_one(run, tmp_path, table):
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
         sink.write(sample(run, 0))
@@ -182,9 +176,7 @@ def test_a_table_whose_columns_are_damaged_is_not_an_empty_one(run: Experiment, 
         twodof.recover(bag)
 
 
-def test_a_bag_of_which_nothing_can_be_read_stays(
-    run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bag_of_which_nothing_can_be_read_stays(run, tmp_path, capsys):
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
         sink.write(sample(run, 0))
@@ -198,7 +190,7 @@ def test_a_bag_of_which_nothing_can_be_read_stays(
 
 
 @pytest.mark.parametrize("named", ["", "a file", "nothing"])
-def test_sqlite3_transaction_that_was_cut_is_rolled_back(run: Experiment, tmp_path: Path, named: str) -> None:
+def test_sqlite3_transaction_that_was_cut_is_rolled_back(run, tmp_path, named):
     """Also where its journal names that of several databases, which SQLite would delete."""
     bag = unfinished(tmp_path, run, "sqlite3", 200)
     file = bag / "bag.db3"
@@ -240,7 +232,7 @@ def super_journal(path: Path) -> bytes:
 
 
 @both_storages
-def test_recovered_bag_is_the_one_that_closing_makes(run: Experiment, tmp_path: Path, storage: str) -> None:
+def test_recovered_bag_is_the_one_that_closing_makes(run, tmp_path, storage):
     bag = unfinished(tmp_path, run, storage, 2 * BATCH + 1, scene=True)
     with twodof.Bag(tmp_path / "closed" / "bag", storage=storage, scene=True).begin(run) as closed:
         for k in range(2 * BATCH + 1):
@@ -267,7 +259,7 @@ DEFINITION = "# a comment\nfloat64[] readings\nstring unit\n"
 
 
 @pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.STORAGE])
-def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path: Path, compression: CompressionMode) -> None:
+def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path, compression):
     """Two files, as of a recorder that splits; the last lacks its end."""
     from twodof.ros.messages import LATCHED
 
@@ -306,7 +298,7 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path: Path, 
     assert connections["/talk"].digest == STORE.hash_rihs01("std_msgs/msg/String")
 
 
-def test_no_more_profiles_are_read_than_take_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_profiles_are_read_than_take_no_time(tmp_path, monkeypatch):
     """Each topic has a profile of its own; YAML is slow."""
     (tmp_path / "bag").mkdir()
     profiles = ["- {depth: [" + "1," * 300 + f"]}}#{i:02}" for i in range(50)]
@@ -326,7 +318,7 @@ def test_no_more_profiles_are_read_than_take_no_time(tmp_path: Path, monkeypatch
     assert read == profiles[:3]
 
 
-def test_messages_in_another_form_are_left_out_and_named(tmp_path: Path) -> None:
+def test_messages_in_another_form_are_left_out_and_named(tmp_path):
     (tmp_path / "bag").mkdir()
     other = record(4, struct.pack("<HH", 2, 1), texts("/text", "json", ""))
     content = b"".join([HEADER, SCHEMA, CHANNEL, other, message(bytes(4)), message(b"{}", number=2)])
@@ -339,9 +331,7 @@ def test_messages_in_another_form_are_left_out_and_named(tmp_path: Path) -> None
 # --- what is said, and what is refused ---
 
 
-def test_unfinished_bag_is_named_with_the_command(
-    run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unfinished_bag_is_named_with_the_command(run, tmp_path, capsys):
     bag = unfinished(tmp_path, run, "mcap", 10)
     assert main(["info", str(bag)]) == 1
     said = capsys.readouterr().err
@@ -351,7 +341,7 @@ def test_unfinished_bag_is_named_with_the_command(
     assert main(["info", str(bag)]) == 0
 
 
-def test_bag_that_is_being_written_is_left_alone(run: Experiment, tmp_path: Path) -> None:
+def test_bag_that_is_being_written_is_left_alone(run, tmp_path):
     with twodof.Bag(tmp_path / "bag", storage="sqlite3").begin(run) as bag:
         bag.write(sample(run, 0))
         for refused in (twodof.recover, twodof.read_bag):
@@ -363,7 +353,7 @@ def test_bag_that_is_being_written_is_left_alone(run: Experiment, tmp_path: Path
     assert assert_consistent(bag.path, "sqlite3") == 1
 
 
-def test_complete_bag_is_left_as_it_is(run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_complete_bag_is_left_as_it_is(run, tmp_path, capsys):
     with twodof.Bag(tmp_path / "bag", storage="sqlite3").begin(run) as bag:
         bag.write(sample(run, 0))
     before = content(tmp_path)
@@ -373,7 +363,7 @@ def test_complete_bag_is_left_as_it_is(run: Experiment, tmp_path: Path, capsys: 
 
 
 @pytest.mark.parametrize("damage", ["metadata.yaml", "short metadata", "mcap"])
-def test_damaged_bag_is_made_anew(run: Experiment, tmp_path: Path, damage: str) -> None:
+def test_damaged_bag_is_made_anew(run, tmp_path, damage):
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(20):
             bag.write(sample(run, k))
@@ -388,7 +378,7 @@ def test_damaged_bag_is_made_anew(run: Experiment, tmp_path: Path, damage: str) 
     assert assert_consistent(bag.path, "mcap") == 20
 
 
-def test_damaged_provenance_does_not_keep_the_messages(run: Experiment, tmp_path: Path) -> None:
+def test_damaged_provenance_does_not_keep_the_messages(run, tmp_path):
     bag = unfinished(tmp_path, run, "mcap", 10)
     (bag / "run.json").write_text('{"format": 1, "fmu": {"na')
     twodof.recover(bag)
@@ -397,7 +387,7 @@ def test_damaged_provenance_does_not_keep_the_messages(run: Experiment, tmp_path
 
 
 @pytest.mark.parametrize("place", ["nowhere", "file", "empty", "no bag", "both", "taken"])
-def test_what_cannot_be_recovered_is_refused_and_left_alone(run: Experiment, tmp_path: Path, place: str) -> None:
+def test_what_cannot_be_recovered_is_refused_and_left_alone(run, tmp_path, place):
     bag = unfinished(tmp_path, run, "mcap", 10)
     if place == "taken":
         (tmp_path / "bag.unfinished").mkdir()
@@ -418,9 +408,7 @@ def test_what_cannot_be_recovered_is_refused_and_left_alone(run: Experiment, tmp
     assert content(tmp_path) == before
 
 
-def test_bag_on_a_disk_without_room_for_another_stays_as_it_was(
-    run: Experiment, tmp_path: Path, disk: Callable[..., Path]
-) -> None:
+def test_bag_on_a_disk_without_room_for_another_stays_as_it_was(run, tmp_path, disk):
     big = unfinished(tmp_path, run, "mcap", 4000)
     folder = disk(content_size(big) // 1024 + 200)
     shutil.copytree(big, folder / "bag")
@@ -457,7 +445,7 @@ for last, bag in enumerate(bags):
 """
 
 
-def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(run: Experiment, tmp_path: Path) -> None:
+def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(run, tmp_path):
     """Its changes to folders, one after the other; the last of these have not so many."""
     living = unfinished(tmp_path, run, "mcap", 200)
     before = content(living)
@@ -481,9 +469,7 @@ def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(run: 
 
 
 @pytest.mark.parametrize("failing", [1, 2])
-def test_recovery_that_cannot_rename_leaves_the_bag_as_it_was(
-    run: Experiment, tmp_path: Path, failing: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recovery_that_cannot_rename_leaves_the_bag_as_it_was(run, tmp_path, failing, monkeypatch):
     bag = unfinished(tmp_path, run, "mcap", 10)
     before = content(tmp_path)
     rename, calls = os.rename, []
@@ -500,9 +486,7 @@ def test_recovery_that_cannot_rename_leaves_the_bag_as_it_was(
     assert content(tmp_path) == before
 
 
-def test_bag_that_is_being_recovered_is_left_alone(
-    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bag_that_is_being_recovered_is_left_alone(run, tmp_path, monkeypatch):
     """By another recovery and by a run that would overwrite it, at any moment."""
     bag = unfinished(tmp_path, run, "mcap", 10)
     rename, said = os.rename, []
@@ -522,7 +506,7 @@ def test_bag_that_is_being_recovered_is_left_alone(
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
 
 
-def test_bag_is_recovered_from_within(run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bag_is_recovered_from_within(run, tmp_path, monkeypatch):
     bag = unfinished(tmp_path, run, "mcap", 10)
     monkeypatch.chdir(bag)
     assert twodof.recover(".").original == tmp_path / "bag.unfinished"

@@ -1,7 +1,5 @@
 """Invalid input gets one line that names the culprit, and leaves nothing."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re
@@ -31,7 +29,7 @@ def listing(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 @pytest.fixture(scope="module")
-def bag_path(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag_path(fmu_path, tmp_path_factory):
     path = tmp_path_factory.mktemp("bag") / "bag"
     twodof.simulate(fmu_path, twodof.Bag(path), stop_time=0.05)
     return path
@@ -263,9 +261,7 @@ BAD: dict[str, Case] = {
 
 
 @pytest.mark.parametrize(("make", "arguments", "culprit"), BAD.values(), ids=BAD)
-def test_bad_input_gets_one_line_and_leaves_nothing(
-    make: Callable[[Path], None], arguments: list[str], culprit: str, folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_gets_one_line_and_leaves_nothing(make, arguments, culprit, folder, capfd):
     make(folder)
     before = listing(folder.parent)
     status = main(arguments)
@@ -330,9 +326,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
         ),
     ],
 )
-def test_a_wrong_command_line_is_status_2(
-    arguments: list[str], culprit: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_command_line_is_status_2(arguments, culprit, folder, capsys):
     before = listing(folder)
     try:
         status: object = main(arguments)
@@ -343,7 +337,7 @@ def test_a_wrong_command_line_is_status_2(
     assert listing(folder) == before
 
 
-def test_refused_build_keeps_the_file_that_was_there(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_refused_build_keeps_the_file_that_was_there(folder, capfd):
     (folder / "arm.urdf").write_text(urdf(kind="planar"))
     (folder / "new.fmu").write_bytes(b"before")
     assert main(BUILD) == 1
@@ -352,9 +346,7 @@ def test_refused_build_keeps_the_file_that_was_there(folder: Path, capfd: pytest
 
 
 @pytest.mark.parametrize("provenance", ["{}", '{"robot": "x"}', "[]", "1"])
-def test_info_of_a_bag_with_a_run_json_of_another_tool(
-    provenance: str, bag_path: Path, folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_info_of_a_bag_with_a_run_json_of_another_tool(provenance, bag_path, folder, capfd):
     shutil.copytree(bag_path, folder / "bag")
     (folder / "bag/run.json").write_text(provenance)
     assert main(["info", "bag"]) == 0
@@ -365,9 +357,7 @@ HOSTILE = "\x1b]0;title\x07 \x9b2J \x1b[31m"
 """Commands to a terminal, which some carry out whoever printed them."""
 
 
-def test_text_of_a_bag_is_no_command_to_the_terminal(
-    bag_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_text_of_a_bag_is_no_command_to_the_terminal(bag_path, tmp_path, capsys):
     bag = tmp_path / "bag"
     shutil.copytree(bag_path, bag)
     provenance = json.loads((bag / "run.json").read_text())
@@ -384,9 +374,7 @@ def test_text_of_a_bag_is_no_command_to_the_terminal(
 
 
 @pytest.mark.parametrize("kept", [0, 10, 300])
-def test_info_of_a_truncated_bag_is_refused(
-    kept: int, bag_path: Path, folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_info_of_a_truncated_bag_is_refused(kept, bag_path, folder, capfd):
     shutil.copytree(bag_path, folder / "bag")
     file = folder / "bag/bag.mcap"
     file.write_bytes(file.read_bytes()[:kept])
@@ -394,7 +382,7 @@ def test_info_of_a_truncated_bag_is_refused(
     assert re.fullmatch("twodof: error: .*'bag'.*\n", capfd.readouterr().err)
 
 
-def test_damaged_default_fmu_is_built_again(folder: Path, fmu_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_default_fmu_is_built_again(folder, fmu_path, capfd):
     (folder / "TwoDof.fmu").write_bytes(damaged(fmu_path.read_bytes()))
     assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 0
     assert (folder / "TwoDof.fmu").read_bytes() == fmu_path.read_bytes()
@@ -402,9 +390,7 @@ def test_damaged_default_fmu_is_built_again(folder: Path, fmu_path: Path, capfd:
     assert capfd.readouterr().err == said
 
 
-def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(
-    folder: Path, native_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(folder, native_path, capfd):
     """Also where there are others; what `run` could not do is not suggested."""
     assert main(["build", "--control", "effort", "--no-meshes", "-o", "TwoDof.fmu"]) == 0
     before = (folder / "TwoDof.fmu").read_bytes()
@@ -416,7 +402,7 @@ def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(
     assert (folder / "TwoDof.fmu").read_bytes() == before and not (folder / "bag").exists()
 
 
-def test_a_run_replaces_no_file_that_is_not_its_own(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_run_replaces_no_file_that_is_not_its_own(folder, capfd):
     """Neither notes nor an FMU of another state of the URDF, unless it is told to."""
     (folder / "robot.urdf").write_text(urdf())
     (folder / "robot.fmu").write_text("notes")
@@ -436,9 +422,7 @@ def test_a_run_replaces_no_file_that_is_not_its_own(folder: Path, capfd: pytest.
 
 
 @pytest.mark.parametrize("verb", ["run", "page", "sweep --grid Kp=1:2:2"])
-def test_the_only_fmu_of_a_folder_is_asked_for_by_name(
-    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_only_fmu_of_a_folder_is_asked_for_by_name(verb, tmp_path, monkeypatch, capfd):
     """Another robot's is neither run without its name nor replaced by the default arm's."""
     folder = tmp_path
     monkeypatch.chdir(folder)

@@ -1,7 +1,5 @@
 """A run of the tests: its temporary folder, its lines about missing tools, its order."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -51,7 +49,7 @@ def ran(folder: Path, text: str, *options: str, ci: str = "") -> subprocess.Comp
     )
 
 
-def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path: Path) -> None:
+def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path):
     for options in (["-n", "0"], ["-n", "2"]):
         done = ran(tmp_path, KEPT, *options)
         assert done.returncode == 1 and "1 passed" in done.stdout
@@ -61,14 +59,14 @@ def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path: Path) -> No
         shutil.rmtree(folder)
 
 
-def test_a_run_that_leaves_nothing_removes_its_folder(tmp_path: Path) -> None:
+def test_a_run_that_leaves_nothing_removes_its_folder(tmp_path):
     for options in (["-n", "0"], ["-n", "2"]):
         done = ran(tmp_path, CLEAN, *options)
         assert (done.returncode, done.stderr) == (0, "") and "1 passed" in done.stdout
         assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_a_missing_tool_is_one_line_and_a_failure_in_ci(tmp_path: Path) -> None:
+def test_a_missing_tool_is_one_line_and_a_failure_in_ci(tmp_path):
     line = "tests of the moon were not run: apt install rocket"
     done = ran(tmp_path, TOOL, "-n", "0")
     assert done.returncode == 0 and done.stdout.count(f"\n3 {line}\n") == 1
@@ -76,7 +74,7 @@ def test_a_missing_tool_is_one_line_and_a_failure_in_ci(tmp_path: Path) -> None:
     assert done.returncode == 1 and "3 failed" in done.stdout and line in done.stdout
 
 
-def test_the_seed_of_the_order_is_printed(tmp_path: Path) -> None:
+def test_the_seed_of_the_order_is_printed(tmp_path):
     """And the same seed gives the same order."""
     text = "import pytest\n@pytest.mark.parametrize('i', range(20))\ndef test_it(i): pass\n"
     orders = []

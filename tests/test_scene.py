@@ -4,8 +4,6 @@ Quaternions and rpy angles are turned into matrices by SciPy, meshes are read by
 they are COLLADA files, by Pinocchio.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import logging
@@ -127,12 +125,12 @@ def nothing(_: str) -> None:
 
 
 @pytest.fixture
-def robot(request: pytest.FixtureRequest, robots: Path) -> str:
+def robot(request, robots):
     return (robots / ROBOTS[request.param]).read_text()
 
 
 @pytest.mark.parametrize("robot", list(ROBOTS), indirect=True)
-def test_transforms_and_end_effector_are_the_placements_of_pinocchio(robot: str) -> None:
+def test_transforms_and_end_effector_are_the_placements_of_pinocchio(robot):
     joints = moving_joints(robot)[::-1]  # not in the order of the file
     last = ET.fromstring(robot).findall("link")[-1].get("name", "")
     scene = Scene(robot, joints, last, nothing)
@@ -147,7 +145,7 @@ def test_transforms_and_end_effector_are_the_placements_of_pinocchio(robot: str)
 
 
 @pytest.mark.filterwarnings("error")
-def test_fixed_joint_may_have_a_zero_axis() -> None:
+def test_fixed_joint_may_have_a_zero_axis():
     urdf = (
         '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="fixed">'
         '<parent link="a"/><child link="b"/><origin xyz="1 2 3"/><axis xyz="0 0 0"/>'
@@ -160,7 +158,7 @@ def test_fixed_joint_may_have_a_zero_axis() -> None:
 
 @pytest.mark.parametrize("axis", ["1 0 0", "0 1 0", "0 0 1", "-3 2 1"])
 @pytest.mark.parametrize("angle", [0.0, 1e-9, -1.0, math.pi, 3.3, -math.pi])
-def test_quaternion_is_x_y_z_w_also_near_half_turns(axis: str, angle: float) -> None:
+def test_quaternion_is_x_y_z_w_also_near_half_turns(axis, angle):
     urdf = (
         '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
         f'<parent link="a"/><child link="b"/><axis xyz="{axis}"/></joint></robot>'
@@ -202,13 +200,13 @@ def xyz(message: Any) -> list[float]:
 
 
 @pytest.fixture(scope="module")
-def fmu_urdf(fmu_path: Path) -> str:
+def fmu_urdf(fmu_path):
     with zipfile.ZipFile(fmu_path) as fmu:
         return fmu.read("resources/robot.urdf").decode()
 
 
 @pytest.fixture(scope="module")
-def messages(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Messages:
+def messages(fmu_path, tmp_path_factory):
     """Return the messages of a run of the default arm whose target jumps after 0.5 s."""
     folder = tmp_path_factory.mktemp("scene")
     inputs = folder / "inputs.csv"
@@ -218,7 +216,7 @@ def messages(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Messag
     return read(folder / "bag")
 
 
-def test_scene_has_one_message_a_sample_and_one_on_latched_topics(messages: Messages) -> None:
+def test_scene_has_one_message_a_sample_and_one_on_latched_topics(messages):
     """Their stamps are their log times."""
     streams = ["/joint_states", "/tf", "/target", "/end_effector"]
     assert set(messages) == {*streams, *LATCHED}
@@ -230,7 +228,7 @@ def test_scene_has_one_message_a_sample_and_one_on_latched_topics(messages: Mess
             assert {nanoseconds(part.header.stamp) for part in parts} <= {log_time}
 
 
-def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(messages: Messages, fmu_urdf: str) -> None:
+def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(messages, fmu_urdf):
     ((_, static),) = messages["/tf_static"]
     for (_, state), (_, tf) in zip(messages["/joint_states"], messages["/tf"], strict=True):
         expected = placements(fmu_urdf, list(state.name), np.array(state.position))
@@ -238,7 +236,7 @@ def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(messages: Mes
         assert_same_poses(found, expected, fmu_urdf)
 
 
-def test_end_effector_and_target_are_in_the_root_frame(messages: Messages) -> None:
+def test_end_effector_and_target_are_in_the_root_frame(messages):
     states, points, targets = (messages[f"/{it}"] for it in ("joint_states", "end_effector", "target"))
     for (_, state), (_, point), (_, target) in zip(states, points, targets, strict=True):
         assert point.header.frame_id == target.header.frame_id == "world"
@@ -249,9 +247,7 @@ def test_end_effector_and_target_are_in_the_root_frame(messages: Messages) -> No
     assert found[51:] == [[0.1, 0.2, 0.0]] * 50  # the change and sample 50 are at the same time
 
 
-def test_target_follows_the_end_effector_along_axes_that_are_not_controlled(
-    robots: Path, ur5: str, tmp_path: Path
-) -> None:
+def test_target_follows_the_end_effector_along_axes_that_are_not_controlled(robots, ur5, tmp_path):
     options = twodof.FmuOptions(urdf=robots / ROBOTS["ur5"], mesh_dir=robots.parents[1], frame="tool0", axes="zx")
     fmu = twodof.build_fmu(tmp_path / "ur5.fmu", options)
     run = twodof.experiment(fmu)
@@ -331,7 +327,7 @@ def assert_same_robot(description: str, urdf: str) -> None:
     assert found == expected
 
 
-def test_description_of_the_default_arm_holds_its_meshes(messages: Messages, fmu_path: Path, fmu_urdf: str) -> None:
+def test_description_of_the_default_arm_holds_its_meshes(messages, fmu_path, fmu_urdf):
     ((_, message),) = messages["/robot_description"]
     assert_same_robot(message.data, fmu_urdf)
     model = pin.buildModelFromXML(message.data)
@@ -348,7 +344,7 @@ def test_description_of_the_default_arm_holds_its_meshes(messages: Messages, fmu
         assert_shapes_hold_the_meshes(message.data, fmu_urdf, vertices)
 
 
-def test_description_of_the_ur5_holds_its_meshes(robots: Path, ur5: str) -> None:
+def test_description_of_the_ur5_holds_its_meshes(robots, ur5):
     folder = robots.parents[1]
     joints = moving_joints(ur5)
     description = Scene(ur5, joints, "tool0", lambda name: (folder / name).read_bytes()).description
@@ -395,7 +391,7 @@ def placed(seed: int) -> np.ndarray:
         ("cylinder", (0.1, 0.25)),
     ],
 )
-def test_fit_recovers_a_box_or_a_cylinder(seed: int, kind: str, size: tuple[float, ...]) -> None:
+def test_fit_recovers_a_box_or_a_cylinder(seed, kind, size):
     if kind == "box":
         mesh = trimesh.creation.box(extents=size, transform=placed(seed))
     else:
@@ -409,7 +405,7 @@ def test_fit_recovers_a_box_or_a_cylinder(seed: int, kind: str, size: tuple[floa
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_fit_finds_the_axis_of_a_cylinder(axis: int) -> None:
+def test_fit_finds_the_axis_of_a_cylinder(axis):
     mesh = trimesh.creation.cylinder(0.04, 0.3, sections=64)
     mesh.vertices = np.roll(mesh.vertices, axis + 1, axis=1)
     shape, fitted = fitted_shape(mesh)
@@ -433,7 +429,7 @@ def single(vertices: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angles", ["0 0 0", "0.3 -0.4 2.5", "0 1.5707963267948966 0", "1 -1.5707963267948966 2"])
-def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles: str) -> None:
+def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles):
     mesh = trimesh.creation.box(extents=(300.0, 100.0, 50.0))
     mesh.apply_translation([10.0, 20.0, 30.0])
     origin = f'<origin xyz="1 2 3" rpy="{angles}"/>'
@@ -443,13 +439,13 @@ def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles: str) -> None:
 
 
 @pytest.mark.parametrize("attributes", [' scale="x"', ' scale="nan 1 1"'])
-def test_a_mesh_that_is_not_placed_by_numbers_is_refused(attributes: str) -> None:
+def test_a_mesh_that_is_not_placed_by_numbers_is_refused(attributes):
     with pytest.raises(RobotError, match="its meshes cannot be placed: "):
         Scene(with_mesh(attributes), [], "thing", lambda _: None)
 
 
 @pytest.mark.parametrize("k", range(24))
-def test_fit_is_right_where_the_shape_is_turned_by_right_angles(k: int) -> None:
+def test_fit_is_right_where_the_shape_is_turned_by_right_angles(k):
     # a third of these have a pitch of a right angle, where roll and yaw turn about one axis
     turned = placed(1)
     mesh = trimesh.creation.box(extents=(0.3, 0.1, 0.05), transform=turned)
@@ -459,9 +455,7 @@ def test_fit_is_right_where_the_shape_is_turned_by_right_angles(k: int) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"this is no mesh"], ids=["missing", "unreadable"])
-def test_mesh_that_cannot_be_read_is_left_out_and_named(
-    content: bytes | None, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_mesh_that_cannot_be_read_is_left_out_and_named(content, caplog):
     with caplog.at_level(logging.WARNING):
         description = Scene(with_mesh(), [], "thing", lambda _: content).description
     assert "thing.stl" in caplog.text
@@ -473,7 +467,7 @@ def test_mesh_that_cannot_be_read_is_left_out_and_named(
 UP = "../" * 40  # from a temporary folder to the root
 
 
-def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path, caplog):
     """A page, or a file made of it, would have the secret's bytes as vertices."""
     (tmp_path / "secret").write_bytes(struct.pack("<9f", *range(9)))
     content = {
@@ -492,7 +486,7 @@ def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path: Path, capl
     assert geometries(description) == []
 
 
-def test_library_of_colours_is_not_read_with_a_mesh(tmp_path: Path) -> None:
+def test_library_of_colours_is_not_read_with_a_mesh(tmp_path):
     """One that is a pipe would be waited for without end."""
     os.mkfifo(tmp_path / "pipe")
     content = f"mtllib {UP}{tmp_path}/pipe\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n"
@@ -512,7 +506,7 @@ def description_in(bag: Path) -> str:
     return str(message.data)
 
 
-def test_meshes_of_a_scene_are_opened_by_their_uris(native_path: Path, tmp_path: Path) -> None:
+def test_meshes_of_a_scene_are_opened_by_their_uris(native_path, tmp_path):
     bag = tmp_path / "a b#1%20ü?"
     twodof.simulate(native_path, twodof.Bag(bag, meshes=True), stop_time=0.02)
     names = [str(mesh.get("filename")) for mesh in ET.fromstring(description_in(bag)).iter("mesh")]
@@ -522,7 +516,7 @@ def test_meshes_of_a_scene_are_opened_by_their_uris(native_path: Path, tmp_path:
             assert content.read() == (bag / "meshes" / Path(name).name).read_bytes()
 
 
-def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path: Path) -> None:
+def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path):
     """By Pinocchio's reader of URDF and meshes, from the description in the bag and the files that it names."""
     fmu = twodof.build_fmu(tmp_path / "panda.fmu", twodof.stock_robot("panda"))
     twodof.simulate(fmu, twodof.Bag(tmp_path / "Müller", meshes=True), stop_time=0.02)

@@ -1,13 +1,10 @@
 """The server of a page: requests that it answers or refuses."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import socket
 import sys
 import urllib.request
-from collections.abc import Sequence
 
 import browser
 import pytest
@@ -32,9 +29,7 @@ ASKED = {
 
 
 @pytest.mark.parametrize(("host", "own", "other"), [(k, *v) for k, v in ASKED.items()], ids=ASKED)
-def test_page_answers_to_its_own_name_and_its_own_page_alone(
-    host: str, own: Sequence[str], other: Sequence[str]
-) -> None:
+def test_page_answers_to_its_own_name_and_its_own_page_alone(host, own, other):
     """Requests for the page and for a websocket, with the headers that a browser sends."""
 
     async def talk(connection: object) -> None:
@@ -72,7 +67,7 @@ def test_page_answers_to_its_own_name_and_its_own_page_alone(
         ("::", "::ffff:127.0.0.1"),
     ],
 )
-def test_a_token_is_of_no_use_to_another_user(host: str, asked: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_token_is_of_no_use_to_another_user(host, asked, monkeypatch):
     """All users of a machine can read the command line of a browser, which has the token."""
     user = os.geteuid() or browser.NOBODY
     with Server(b"page", host, 0, token="secret") as server:
@@ -83,13 +78,13 @@ def test_a_token_is_of_no_use_to_another_user(host: str, asked: str, monkeypatch
                 assert one.recv(100).split()[1] == status
 
 
-def test_a_request_that_is_no_text_is_refused() -> None:
+def test_a_request_that_is_no_text_is_refused():
     with Server(b"page", port=0, token="secret") as server, browser.connected(server.url, "127.0.0.1") as one:
         one.sendall(b"GET /?token=\xff HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert one.recv(100).split()[1] == b"403"
 
 
-def test_a_server_has_one_page_and_no_socket_that_it_does_not_need() -> None:
+def test_a_server_has_one_page_and_no_socket_that_it_does_not_need():
     own = ("Host", "localhost")
     with Server(b"page", port=0) as server:
         for path in ("/socket", "/?bag=other", "/run.json", "/../run.json", "//evil.example"):
@@ -97,7 +92,7 @@ def test_a_server_has_one_page_and_no_socket_that_it_does_not_need() -> None:
             assert browser.answer(server.url, own, *browser.UPGRADE, path=path) == 404
 
 
-def test_port_that_another_is_about_to_serve() -> None:
+def test_port_that_another_is_about_to_serve():
     with Server(b"", port=0) as free:
         port = int(free.url.rpartition(":")[2])
     first = Server(b"", port=port)
@@ -108,7 +103,7 @@ def test_port_that_another_is_about_to_serve() -> None:
 
 
 @pytest.mark.parametrize("method", ["HEAD", "POST", "DELETE"])
-def test_what_a_page_is_not_asked_for_is_answered(method: str) -> None:
+def test_what_a_page_is_not_asked_for_is_answered(method):
     """By its own word, as by curl -I."""
     with Server(b"page", port=0) as server:
         asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)
@@ -118,7 +113,7 @@ def test_what_a_page_is_not_asked_for_is_answered(method: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_page_on_all_addresses_is_opened_as_printed(host: str) -> None:
+def test_a_page_on_all_addresses_is_opened_as_printed(host):
     with Server(b"page", host, 0) as server:
         assert f"//{host}:" not in server.url and "[::]" not in server.url
         with urllib.request.urlopen(server.url, timeout=10) as answer:

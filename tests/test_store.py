@@ -1,7 +1,5 @@
 """One bag of several robots: each robot's part equals a bag of that robot alone."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -33,7 +31,7 @@ NAMES = {"left": "effort", "fleet/right": "task", "fleet_right": "pose"}
 
 
 @pytest.fixture(scope="module")
-def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def fmus(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robots")
     return {
         name: twodof.build_fmu(folder / f"{control}.fmu", twodof.FmuOptions(control=control, native=True))
@@ -67,13 +65,13 @@ def logged(fmus: dict[str, Path], path: Path, **options: Any) -> Path:
 
 
 @pytest.fixture(scope="module")
-def three(fmus: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def three(fmus, tmp_path_factory):
     """A bag of three robots, to be read."""
     return logged(fmus, tmp_path_factory.mktemp("three") / "bag", scene=True)
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_each_robot_has_its_topics_as_if_it_were_alone(fmus: dict[str, Path], tmp_path: Path, storage: str) -> None:
+def test_each_robot_has_its_topics_as_if_it_were_alone(fmus, tmp_path, storage):
     """By rosbags, bit for bit those of a bag of its own."""
     together = messages_of(logged(fmus, tmp_path / "bag", storage=storage, scene=True, effort=True))
     topics = set()
@@ -87,9 +85,7 @@ def test_each_robot_has_its_topics_as_if_it_were_alone(fmus: dict[str, Path], tm
     assert set(together) == topics and len(topics) == 17  # an effort has no target
 
 
-def test_a_robot_is_read_by_its_address(
-    fmus: dict[str, Path], three: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robot_is_read_by_its_address(fmus, three, tmp_path, capsys):
     bag = three
     for name, fmu in fmus.items():
         run = read_bag(f"{bag}:{name}")
@@ -119,9 +115,7 @@ def test_a_robot_is_read_by_its_address(
     assert np.array_equal(read_bag(again).q, read_bag(f"{bag}:fleet/right").q)
 
 
-def test_which_robot_is_meant_must_be_said(
-    fmus: dict[str, Path], three: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_which_robot_is_meant_must_be_said(fmus, three, tmp_path, capsys):
     bag = three
     there = f"'{bag}:fleet/right', '{bag}:fleet_right', '{bag}:left'"
     for of, reason in (("", "is of several robots; give one"), (":no", "has no robot 'no'")):
@@ -141,9 +135,7 @@ def test_which_robot_is_meant_must_be_said(
     assert np.array_equal(read_bag(alone.path).q, read_bag(only.path).q)  # a copy is no robot
 
 
-def test_a_robot_in_anothers_namespace_has_its_own_topics(
-    fmus: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_robot_in_anothers_namespace_has_its_own_topics(fmus, tmp_path, caplog):
     experiments, bag = runs(fmus), twodof.Bag(tmp_path / "bag")
     outer, inner = experiments["left"], experiments["fleet/right"]
     simulate_together([Member(outer, [bag.of("a")]), Member(inner, [bag.of("a/b")])])
@@ -162,7 +154,7 @@ def test_a_robot_in_anothers_namespace_has_its_own_topics(
 
 
 @pytest.mark.parametrize("names", [("a", "/a"), ("", "a"), ("a", "")])
-def test_robots_need_names_that_differ(fmus: dict[str, Path], tmp_path: Path, names: tuple[str, str]) -> None:
+def test_robots_need_names_that_differ(fmus, tmp_path, names):
     run = runs(fmus)["left"]
     bag = twodof.Bag(tmp_path / "bag")
     members = [Member(run, [bag.of(name) if name else bag]) for name in names]
@@ -172,7 +164,7 @@ def test_robots_need_names_that_differ(fmus: dict[str, Path], tmp_path: Path, na
         bag.of("1st")
 
 
-def test_no_robot_comes_late(fmus: dict[str, Path], tmp_path: Path) -> None:
+def test_no_robot_comes_late(fmus, tmp_path):
     run = runs(fmus)["left"]
     bag = twodof.Bag(tmp_path / "bag")
     early, late = bag.of("early").begin(run), bag.of("late").begin(run)
@@ -184,7 +176,7 @@ def test_no_robot_comes_late(fmus: dict[str, Path], tmp_path: Path) -> None:
     assert read_bag(f"{bag.path}:early").count == 51
 
 
-def test_a_robot_that_does_not_begin_costs_no_bag(fmus: dict[str, Path], tmp_path: Path) -> None:
+def test_a_robot_that_does_not_begin_costs_no_bag(fmus, tmp_path):
     kept = logged(fmus, tmp_path / "bag")
     before = (kept / "bag.mcap").read_bytes()
     bag = twodof.Bag(kept, overwrite=True)
@@ -195,12 +187,12 @@ def test_a_robot_that_does_not_begin_costs_no_bag(fmus: dict[str, Path], tmp_pat
     assert (kept / "bag.mcap").read_bytes() == before
 
 
-def test_a_sink_is_of_a_robot_that_there_is(fmus: dict[str, Path]) -> None:
+def test_a_sink_is_of_a_robot_that_there_is(fmus):
     with pytest.raises(InputError, match="'lift', but the robots are left, fleet/right"):
         twodof.publish_together(runs(fmus, 0.02), sinks={"lift": []})
 
 
-def test_a_robot_that_comes_after_the_others_replaces_none(fmus: dict[str, Path], tmp_path: Path) -> None:
+def test_a_robot_that_comes_after_the_others_replaces_none(fmus, tmp_path):
     run = runs(fmus)["left"]
     bag = twodof.Bag(tmp_path / "bag", overwrite=True)
     for _ in range(2):  # the same run again may replace itself
@@ -227,7 +219,7 @@ simulate_together(
 """
 
 
-def test_a_killed_bag_is_recovered_with_all_its_robots(fmus: dict[str, Path], tmp_path: Path) -> None:
+def test_a_killed_bag_is_recovered_with_all_its_robots(fmus, tmp_path):
     bag = tmp_path / "bag"
     command = [sys.executable, "-c", LOGGER, str(bag), *map(str, fmus.values())]
     with subprocess.Popen(command) as process:
@@ -248,7 +240,7 @@ def test_a_killed_bag_is_recovered_with_all_its_robots(fmus: dict[str, Path], tm
     assert all(f"twodof/robot{i}:" in metadata for i in range(3))
 
 
-def test_a_bag_of_several_is_replaced_when_asked_to(fmus: dict[str, Path], tmp_path: Path) -> None:
+def test_a_bag_of_several_is_replaced_when_asked_to(fmus, tmp_path):
     bag = logged(fmus, tmp_path / "bag")
     with pytest.raises(BagError, match="exists already"):
         twodof.Bag(bag)
@@ -257,7 +249,7 @@ def test_a_bag_of_several_is_replaced_when_asked_to(fmus: dict[str, Path], tmp_p
     assert sorted(file.name for file in bag.iterdir()) == ["bag.mcap", "metadata.yaml", "run.json"]
 
 
-def test_a_bag_that_is_not_open_takes_no_sample(native_path: Path, tmp_path: Path) -> None:
+def test_a_bag_that_is_not_open_takes_no_sample(native_path, tmp_path):
     """Nothing would write it."""
     run = experiment(native_path, stop_time=0.1)
     bag = twodof.Bag(tmp_path / "bag")
@@ -272,14 +264,14 @@ def test_a_bag_that_is_not_open_takes_no_sample(native_path: Path, tmp_path: Pat
     assert read_bag(tmp_path / "bag").count == bag.count == 1
 
 
-def test_a_copy_of_a_robots_provenance_is_no_robot(tmp_path: Path) -> None:
+def test_a_copy_of_a_robots_provenance_is_no_robot(tmp_path):
     files = [f"run.{name}.json" for name in ("left", "a%2Fb", "left copy", "left (1)", "left.old")]
     for file in files:
         (tmp_path / file).touch()
     assert robots_of(tmp_path) == ["a/b", "left"]
 
 
-def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(native_path: Path, tmp_path: Path) -> None:
+def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(native_path, tmp_path):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     (tmp_path / "bag/run.json").rename(tmp_path / "bag/run.old.json")
     for read in (read_bag, read_ends):
@@ -287,7 +279,7 @@ def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(native_path: Path
             read(tmp_path / "bag")
 
 
-def test_a_robots_bag_is_recovered_by_its_folder(three: Path, tmp_path: Path) -> None:
+def test_a_robots_bag_is_recovered_by_its_folder(three, tmp_path):
     bag = three
     with pytest.raises(BagError, match=rf"there is no bag '.*:left'; 'twodof recover {bag}' repairs"):
         recover(f"{bag}:left")
@@ -295,7 +287,7 @@ def test_a_robots_bag_is_recovered_by_its_folder(three: Path, tmp_path: Path) ->
         recover(tmp_path / "none")
 
 
-def test_each_robot_may_have_its_own_thread(native_path: Path, tmp_path: Path) -> None:
+def test_each_robot_may_have_its_own_thread(native_path, tmp_path):
     """They come, begin and leave at one instant."""
     run, names = runs({"robot": native_path}, 0.1)["robot"], ("left", "right")
     samples = list(twodof.samples(run))

@@ -1,7 +1,5 @@
 """The summary of an MCAP file is used only if its checksum and its numbers are right."""
 
-from __future__ import annotations
-
 import random
 import shutil
 import struct
@@ -27,7 +25,7 @@ FOOTER = 20 + 8  # its fields, and the magic behind it
 
 
 @pytest.fixture(scope="module")
-def original(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original(native_path, tmp_path_factory):
     """Several chunks of a scene's topics."""
     bag = twodof.Bag(tmp_path_factory.mktemp("original") / "bag", scene=True)
     twodof.simulate(native_path, bag, stop_time=30.0, stamp_start=START)
@@ -35,7 +33,7 @@ def original(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 @pytest.fixture
-def bag(original: Path, tmp_path: Path) -> Path:
+def bag(original, tmp_path):
     return Path(shutil.copytree(original, tmp_path / "bag"))
 
 
@@ -63,7 +61,7 @@ def without_checksum(file: Path) -> None:
     file.write_bytes(content[:-12] + bytes(4) + content[-8:])
 
 
-def test_summary_is_that_of_the_mcap_project(bag: Path) -> None:
+def test_summary_is_that_of_the_mcap_project(bag):
     with file_of(bag).open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         theirs = reader.get_summary()
@@ -77,7 +75,7 @@ def test_summary_is_that_of_the_mcap_project(bag: Path) -> None:
     assert len(ours.chunks) > 2
 
 
-def test_a_summary_says_what_reading_all_does(bag: Path) -> None:
+def test_a_summary_says_what_reading_all_does(bag):
     by_summary = ends(bag)
     without_checksum(file_of(bag))
     assert read_summary(file_of(bag)) is None
@@ -87,7 +85,7 @@ def test_a_summary_says_what_reading_all_does(bag: Path) -> None:
     assert by_summary[4] == [whole.q[0].tolist(), whole.q[-1].tolist()]
 
 
-def test_a_summary_is_not_read_with_all_that_comes_before(bag: Path) -> None:
+def test_a_summary_is_not_read_with_all_that_comes_before(bag):
     expected, file = ends(bag), file_of(bag)
     summary, content = read_summary(file), bytearray(file.read_bytes())
     assert summary is not None
@@ -99,7 +97,7 @@ def test_a_summary_is_not_read_with_all_that_comes_before(bag: Path) -> None:
         twodof.read_bag(bag)
 
 
-def test_a_summary_with_a_flipped_bit_is_not_believed(bag: Path) -> None:
+def test_a_summary_with_a_flipped_bit_is_not_believed(bag):
     file, chance = file_of(bag), random.Random(17)
     content = file.read_bytes()
     (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
@@ -114,7 +112,7 @@ def test_a_summary_with_a_flipped_bit_is_not_believed(bag: Path) -> None:
 
 
 @pytest.mark.parametrize("field", [0, 22], ids=["messages", "chunks"])
-def test_numbers_that_contradict_each_other_are_not_believed(bag: Path, field: int) -> None:
+def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
     """With a checksum that is right: messages and those by channel, chunks and their index."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
@@ -126,9 +124,7 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag: Path, field: i
 
 
 @pytest.mark.parametrize("whose", ["metadata.yaml", "summary"])
-def test_a_summary_that_metadata_contradicts_is_told_and_mended(
-    bag: Path, whose: str, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_summary_that_metadata_contradicts_is_told_and_mended(bag, whose, capsys, caplog):
     """Either may be wrong: the file has 12,006 messages."""
     if whose == "summary":
         file = file_of(bag)
@@ -155,7 +151,7 @@ def test_a_summary_that_metadata_contradicts_is_told_and_mended(
     assert "3001 joint states" in capsys.readouterr().out
 
 
-def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag: Path) -> None:
+def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag):
     file = file_of(bag)
     summary, content = read_summary(file), bytearray(file.read_bytes())
     assert summary is not None
@@ -165,7 +161,7 @@ def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag: Path) -> Non
         read_ends(bag)
 
 
-def test_messages_that_the_summary_alone_has_are_missed(tmp_path: Path) -> None:
+def test_messages_that_the_summary_alone_has_are_missed(tmp_path):
     """Its checksum is right, and its only chunk has the topic by another name."""
     file = tmp_path / "bag" / "bag.mcap"
     file.parent.mkdir()
@@ -188,7 +184,7 @@ def test_messages_that_the_summary_alone_has_are_missed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["/joint_states", "/other"])
-def test_ends_of_another_writer_in_any_order(tmp_path: Path, name: str) -> None:
+def test_ends_of_another_writer_in_any_order(tmp_path, name):
     """Small chunks, whose stamps overlap; another topic in some of them."""
     stamps = np.random.default_rng(3).permutation(400)
     file = tmp_path / "bag" / "bag.mcap"
@@ -211,7 +207,7 @@ def test_ends_of_another_writer_in_any_order(tmp_path: Path, name: str) -> None:
     assert (recording.count, recording.q.tolist()) == (400, [[0.0], [399.0]])
 
 
-def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path: Path) -> None:
+def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path):
     """The messages have three channels and few lengths at random, with runs of turns among them."""
     chance, file = random.Random(5), tmp_path / "x.mcap"
     parts = [

@@ -1,7 +1,5 @@
 """Sweeps: metrics against closed forms, the design, and the outcome of each run."""
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 import sys
@@ -56,7 +54,7 @@ def gains() -> list[tuple[float, float]]:
 
 
 @pytest.fixture(scope="module")
-def judged(native_path: Path) -> list[dict[str, float]]:
+def judged(native_path):
     """The metrics of the pairs, by the runs themselves."""
     options = {"stop_time": STOP, "step": STEP, "settings": {}}
     job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)
@@ -66,7 +64,7 @@ def judged(native_path: Path) -> list[dict[str, float]]:
     return [dict(zip(METRICS, row[3:])) for row in rows]
 
 
-def test_metrics_are_those_of_the_closed_form(judged: list[dict[str, float]]) -> None:
+def test_metrics_are_those_of_the_closed_form(judged):
     t = np.arange(501) * STEP
     e0 = TARGET - oracles.position(Q0)
     size = np.linalg.norm(e0)
@@ -88,7 +86,7 @@ def test_metrics_are_those_of_the_closed_form(judged: list[dict[str, float]]) ->
     assert 40 < settled < 60
 
 
-def test_peaks_are_those_of_the_closed_form(judged: list[dict[str, float]]) -> None:
+def test_peaks_are_those_of_the_closed_form(judged):
     """Joint velocities by the inverse of the Jacobian, torques by the textbook's dynamics."""
     t = np.arange(501) * STEP
     start = oracles.position(Q0)
@@ -110,7 +108,7 @@ def test_peaks_are_those_of_the_closed_form(judged: list[dict[str, float]]) -> N
         assert found["peak_effort"] == pytest.approx(effort, rel=1e-6)
 
 
-def test_time_at_limits_is_that_of_the_samples(native_path: Path) -> None:
+def test_time_at_limits_is_that_of_the_samples(native_path):
     """The first joint would pass 0.2 rad on its way down; samples tell how long it stays there."""
     settings = {"q_min": (0.2, -3.0)}
     (row,) = sweep(native_path, grid={"Kp": [50.0]}, settings=settings).to_dict("records")
@@ -120,7 +118,7 @@ def test_time_at_limits_is_that_of_the_samples(native_path: Path) -> None:
     assert row["time_at_limits"] == pytest.approx(at_limit * STEP)
 
 
-def test_what_is_not_defined_is_null(native_path: Path) -> None:
+def test_what_is_not_defined_is_null(native_path):
     at_rest = {"x_des": tuple(oracles.position(Q0))}
     (row,) = sweep(native_path, grid={"Kp": [50.0]}, settings=at_rest).to_dict("records")
     assert np.isnan(row["settling_time"]) and np.isnan(row["overshoot"])
@@ -129,9 +127,7 @@ def test_what_is_not_defined_is_null(native_path: Path) -> None:
 
 @pytest.mark.parametrize("max_step", [1e-3, 1e-9], ids=["finished", "discarded"])
 @pytest.mark.parametrize("flavour", ["python", "native"])
-def test_a_trace_has_the_numbers_of_the_samples(
-    fmu_path: Path, native_path: Path, flavour: str, max_step: float
-) -> None:
+def test_a_trace_has_the_numbers_of_the_samples(fmu_path, native_path, flavour, max_step):
     """To the bit; where a run fails, so do both, at the same step and for the same reason."""
     fmu = {"python": fmu_path, "native": native_path}[flavour]
     run = twodof.experiment(fmu, stop_time=0.5, settings={"max_step": max_step})
@@ -156,7 +152,7 @@ def test_a_trace_has_the_numbers_of_the_samples(
 # --- the design ---
 
 
-def test_design_is_the_product_of_grids_with_the_same_draws(native_path: Path) -> None:
+def test_design_is_the_product_of_grids_with_the_same_draws(native_path):
     options: dict[str, Any] = {"grid": SMALL, "ranges": {"tau_ext[2]": (-0.01, 0.02)}, "random": 4, "seed": 5}
     table = sweep(native_path, stop_time=0.05, **options)
     assert list(table["run"]) == list(range(24))
@@ -166,7 +162,7 @@ def test_design_is_the_product_of_grids_with_the_same_draws(native_path: Path) -
     same(sweep(native_path, stop_time=0.05, **options), table)
 
 
-def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
+def test_a_name_without_an_index_sets_all_elements(native_path):
     both = sweep(native_path, grid={"Kp": [80.0]})
     one = sweep(native_path, grid={"Kp[1]": [80.0]}, settings={"Kp[2]": 80.0})
     columns = list(METRICS)
@@ -208,14 +204,7 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kp=1:2:3", "--scheduler", "nonsense://x"], "does not answer"),
     ],
 )
-def test_bad_input_gets_one_line(
-    arguments: list[str],
-    said: str,
-    native_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_bad_input_gets_one_line(arguments, said, native_path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     if "--scheduler" in arguments:
         monkeypatch.setattr("twodof.sweeps.cluster.SCHEDULER_TIMEOUT", 0.5)
@@ -232,9 +221,7 @@ def test_bad_input_gets_one_line(
     ("package", "extra", "options"),
     [("pyarrow", "sweep", []), ("distributed", "cluster", ["--scheduler", "tcp://127.0.0.1:9"])],
 )
-def test_a_missing_extra_is_named(
-    package: str, extra: str, options: list[str], native_path: Path, tmp_path: Path
-) -> None:
+def test_a_missing_extra_is_named(package, extra, options, native_path, tmp_path):
     missing = f"import sys; sys.modules[{package!r}] = None; "
     code = missing + "from twodof.__main__ import main; sys.exit(main())"
     done = subprocess.run(
@@ -255,7 +242,7 @@ def test_a_missing_extra_is_named(
 # --- one instance, any outcome ---
 
 
-def test_a_runner_instantiates_once_and_repeats_to_the_bit(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_runner_instantiates_once_and_repeats_to_the_bit(native_path, monkeypatch):
     """In any order, what a run gives is what a fresh instance gives."""
     made = []
     instantiate = runner_module.instantiate
@@ -296,7 +283,7 @@ if self.Kp[0] == 5.0:
 """
 
 
-def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: Path) -> None:
+def test_each_run_has_its_outcome_and_harms_no_other(fmu_path, tmp_path):
     odd = changed_step(fmu_path, tmp_path, ODD)
     grid = {"Kp": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0], "rtol": [1e-3, -1.0]}
     table = sweep(odd, grid=grid, stop_time=0.05)
@@ -317,7 +304,7 @@ def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: P
     assert table[columns][finished].to_numpy() == pytest.approx(expected[columns].to_numpy(), nan_ok=True, abs=0)
 
 
-def test_a_run_that_kills_is_given_up_alone(fmu_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_kills_is_given_up_alone(fmu_path, tmp_path, monkeypatch):
     """It is begun three times; what was in its batch, twice at most; all else once.
 
     Those that kill are further apart than a batch is long: in one, the second would not begin.
@@ -333,7 +320,7 @@ def test_a_run_that_kills_is_given_up_alone(fmu_path: Path, tmp_path: Path, monk
     assert max(begun[kp] for kp in begun if kp % 300) <= 2
 
 
-def test_bags_hold_the_runs(native_path: Path, tmp_path: Path) -> None:
+def test_bags_hold_the_runs(native_path, tmp_path):
     table = sweep(native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", bags=True)
     for run in table.to_dict("records"):
         bag = twodof.read_bag(tmp_path / "s/bags" / f"{run['run']:06d}")

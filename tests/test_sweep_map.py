@@ -1,7 +1,5 @@
 """The content of a sweep's map, and the report of its best runs."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from twodof.sweeps.results import read_sweep
 
 
 @pytest.fixture(scope="module")
-def grid_sweep(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def grid_sweep(native_path, tmp_path_factory):
     path = tmp_path_factory.mktemp("sweep") / "whole"
     grid = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
     sweep(native_path, grid=grid, stop_time=10, output=path)
@@ -42,9 +40,7 @@ LINES = """() => [...document.querySelectorAll(".runs td")].map(cell => {
 })"""
 
 
-def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_phone(
-    grid_sweep: Path, tmp_path: Path
-) -> None:
+def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_phone(grid_sweep, tmp_path):
     page = save(drawing(read_sweep(grid_sweep), "a"), tmp_path / "a.html")
     seen = []
     with browser.chromium() as chromium:
@@ -65,7 +61,7 @@ def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_pho
     assert np.count_nonzero(apart) < 1e-4 * apart.size
 
 
-def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Path) -> None:
+def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep):
     table = table_of(grid_sweep)
     found = panels(grid_sweep)
     told = ("settling_time", "overshoot", "final_error", "rms_error", "peak_effort", "chatter")
@@ -98,7 +94,7 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Pat
         assert critical[:, 1] ** 2 == pytest.approx(4 * critical[:, 0])
 
 
-def test_map_of_one_variable_is_curves(native_path: Path, tmp_path: Path) -> None:
+def test_map_of_one_variable_is_curves(native_path, tmp_path):
     table = sweep(native_path, grid={"Kp": np.linspace(10, 90, 9)}, output=tmp_path / "s")
     for label, axes in panels(tmp_path / "s").items():
         metric = label.split()[0]
@@ -107,7 +103,7 @@ def test_map_of_one_variable_is_curves(native_path: Path, tmp_path: Path) -> Non
         assert np.array(y) == pytest.approx(table[metric].to_numpy(), nan_ok=True, abs=0)
 
 
-def test_map_of_three_variables_is_the_best_over_the_third(native_path: Path, tmp_path: Path) -> None:
+def test_map_of_three_variables_is_the_best_over_the_third(native_path, tmp_path):
     grid = {**SMALL, "tau_ext[1]": [-0.05, 0.0, 0.05]}
     table = sweep(native_path, grid=grid, stop_time=2.0, output=tmp_path / "s")
     found = panels(tmp_path / "s")
@@ -122,7 +118,7 @@ def test_map_of_three_variables_is_the_best_over_the_third(native_path: Path, tm
             assert len(runs) == 3 and cells[i, j] == runs["overshoot"].min()
 
 
-def test_map_of_random_values_is_dots(native_path: Path, tmp_path: Path) -> None:
+def test_map_of_random_values_is_dots(native_path, tmp_path):
     ranges = {"Kp": (10, 90), "Kd": (10, 30)}
     table = sweep(native_path, ranges=ranges, random=25, stop_time=2.0, output=tmp_path / "s")
     axes = panels(tmp_path / "s")["peak_effort over Kp and Kd"]
@@ -131,9 +127,7 @@ def test_map_of_random_values_is_dots(native_path: Path, tmp_path: Path) -> None
     assert np.asarray(dots.get_array()) == pytest.approx(table["peak_effort"].to_numpy(), abs=0)
 
 
-def test_plot_of_a_sweep_prints_the_best_runs(
-    grid_sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plot_of_a_sweep_prints_the_best_runs(grid_sweep, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["plot", str(grid_sweep)]) == 0
     out = capsys.readouterr().out
@@ -151,9 +145,7 @@ def test_plot_of_a_sweep_prints_the_best_runs(
     assert f"{best['Kp']:g}" in save(found, tmp_path / "a.html").read_text("utf-8")
 
 
-def test_where_no_run_settles_the_best_is_another(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_no_run_settles_the_best_is_another(native_path, tmp_path, capsys):
     sweep(native_path, grid={"Kp": [20.0, 60.0]}, stop_time=0.05, output=tmp_path / "s")
     assert main(["info", str(tmp_path / "s")]) == 0
     out = capsys.readouterr().out
@@ -170,7 +162,7 @@ POINT = """run => {
 
 
 @pytest.mark.parametrize("width", [1200, 390])
-def test_a_click_in_the_map_opens_the_runs_curves(native_path: Path, tmp_path: Path, width: int) -> None:
+def test_a_click_in_the_map_opens_the_runs_curves(native_path, tmp_path, width):
     folder = tmp_path / "s"
     sweep(native_path, grid={"Kp": [20, 60, 100], "Kd": [10, 20]}, stop_time=1, output=folder, bags=True)
     page = save(drawing(read_sweep(folder), "s", bags=folder / "bags"), tmp_path / "s.html")

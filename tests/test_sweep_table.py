@@ -1,7 +1,5 @@
 """The table of a sweep: content, resumption and refusals."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -29,7 +27,7 @@ from twodof.simulation.verdict import METRICS
 from twodof.sweeps.results import read_sweep
 
 
-def test_table_is_parquet_with_units_and_provenance(native_path: Path, tmp_path: Path) -> None:
+def test_table_is_parquet_with_units_and_provenance(native_path, tmp_path):
     table = sweep(native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", command_line="by hand")
     (file,) = (tmp_path / "s").iterdir()
     assert file.name == "runs.parquet"
@@ -59,7 +57,7 @@ def begin(fmu: Path, output: Path, *options: str) -> subprocess.Popen[str]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def undisturbed(native_path, tmp_path_factory):
     """A sweep of 320 runs that nothing disturbs."""
     path = tmp_path_factory.mktemp("sweep") / "whole"
     done = begin(native_path, path)
@@ -70,9 +68,7 @@ def undisturbed(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.mark.long
-def test_what_is_interrupted_is_resumed(
-    native_path: Path, undisturbed: Path, tmp_path: Path, length: Callable[[int, int], int]
-) -> None:
+def test_what_is_interrupted_is_resumed(native_path, undisturbed, tmp_path, length):
     """By Ctrl-C to all processes of the terminal, or by the death of the sweep's own."""
     rng = random.Random(3)
     expected = table_of(undisturbed)
@@ -105,7 +101,7 @@ def test_what_is_interrupted_is_resumed(
     assert 0 < min(kept) < 320
 
 
-def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
+def test_resuming_repeats_nothing(native_path, tmp_path):
     stop = Event()
     path, done = tmp_path / "s", []
 
@@ -127,7 +123,7 @@ def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
     assert {file.name: file.read_bytes() for file in path.iterdir()} == made
 
 
-def test_what_is_another_sweep_is_not_resumed(native_path: Path, tmp_path: Path, fmu_path: Path) -> None:
+def test_what_is_another_sweep_is_not_resumed(native_path, tmp_path, fmu_path):
     path = tmp_path / "s"
     options: dict[str, Any] = {"grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True}
     sweep(native_path, **{**options, "resume": False})
@@ -145,7 +141,7 @@ def test_what_is_another_sweep_is_not_resumed(native_path: Path, tmp_path: Path,
     assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
 
-def test_damaged_and_foreign_tables_get_one_line(native_path: Path, tmp_path: Path) -> None:
+def test_damaged_and_foreign_tables_get_one_line(native_path, tmp_path):
     for name, content in (("cut", None), ("empty", b""), ("other", b"PAR1 no")):
         path = tmp_path / name
         sweep(native_path, grid={"Kp": [1.0]}, stop_time=0.02, output=path)
@@ -216,16 +212,14 @@ READING = pa.proxy_memory_pool(pa.default_memory_pool())  # which outlives what 
 
 
 @pytest.fixture(scope="module")
-def sound(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sound(native_path, tmp_path_factory):
     path = tmp_path_factory.mktemp("sound") / "s"
     sweep(native_path, grid={"Kp": [1.0, 2.0]}, stop_time=0.02, output=path, workers=1)
     return path / "runs.parquet"
 
 
 @pytest.mark.parametrize("make", HOSTILE_TABLES.values(), ids=HOSTILE_TABLES)
-def test_hostile_table_gets_one_line_in_little_memory(
-    sound: Path, tmp_path: Path, make: Callable[[pa.Table], pa.Table]
-) -> None:
+def test_hostile_table_gets_one_line_in_little_memory(sound, tmp_path, make):
     store(pq.read_table(sound), tmp_path / "runs.parquet")
     assert len(read_sweep(tmp_path)) == 2
     store(make(pq.read_table(sound)), tmp_path / "runs.parquet")
@@ -240,9 +234,7 @@ def test_hostile_table_gets_one_line_in_little_memory(
 
 
 @pytest.mark.long
-def test_memory_of_the_coordinator_is_flat(
-    native_path: Path, tmp_path: Path, length: Callable[[int, int], int]
-) -> None:
+def test_memory_of_the_coordinator_is_flat(native_path, tmp_path, length):
     """Once pyarrow has written its first rows, for which it takes some 15 MiB."""
     code = """
 import sys, twodof

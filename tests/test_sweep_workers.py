@@ -1,7 +1,5 @@
 """Workers of a sweep on this machine and on a cluster: access, and ends of processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -13,7 +11,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -46,13 +44,13 @@ def doors(process: int) -> dict[str, str]:
 
 
 @pytest.fixture
-def started() -> Callable[[], list[int]]:
+def started():
     """Return the living processes that the test has started; other tests may have left some."""
     others = children_of(os.getpid())
     return lambda: [child for child in children_of(os.getpid()) if child not in others]
 
 
-def test_nobody_else_can_talk_to_workers(native_path: Path, started: Callable[[], list[int]]) -> None:
+def test_nobody_else_can_talk_to_workers(native_path, started):
     """No socket has a port or a name, no other user can write where they read; one thread each."""
     before, seen = doors(os.getpid()), {}
 
@@ -94,9 +92,7 @@ assert not {"dask", "distributed"} & {*sys.modules}
         (["-m", "program"], {}),
     ],
 )
-def test_workers_import_nothing_from_the_working_directory(
-    way: list[str], variables: dict[str, str], native_path: Path, tmp_path: Path
-) -> None:
+def test_workers_import_nothing_from_the_working_directory(way, variables, native_path, tmp_path):
     """Nor the program itself, which shields nothing by ``if __name__ == "__main__"``."""
     (tmp_path / "program.py").write_text(PROGRAM)
     done = subprocess.run(
@@ -112,7 +108,7 @@ def test_workers_import_nothing_from_the_working_directory(
     assert (tmp_path / "numpy.py").exists() and not list(tmp_path.glob("*.sprung"))
 
 
-def test_workers_run_the_package_that_the_program_runs(native_path: Path, tmp_path: Path) -> None:
+def test_workers_run_the_package_that_the_program_runs(native_path, tmp_path):
     """Another one than is installed, in the working directory."""
     shutil.copytree(Path(twodof.__file__).parent, tmp_path / "twodof")
     with (tmp_path / "twodof/simulation/judge.py").open("a") as file:
@@ -136,14 +132,7 @@ def test_workers_run_the_package_that_the_program_runs(native_path: Path, tmp_pa
         ("import os; os._exit(3)", "workers die as they start: exit status 3"),
     ],
 )
-def test_workers_that_cannot_start_tell_why(
-    text: str,
-    said: str,
-    native_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    started: Callable[[], list[int]],
-) -> None:
+def test_workers_that_cannot_start_tell_why(text, said, native_path, tmp_path, monkeypatch, started):
     (tmp_path / "numpy.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(TwoDofError, match=said):
@@ -151,7 +140,7 @@ def test_workers_that_cannot_start_tell_why(
     assert not (tmp_path / "s").exists() and started() == []
 
 
-def test_an_fmu_that_workers_cannot_load_is_named(native_path: Path, tmp_path: Path) -> None:
+def test_an_fmu_that_workers_cannot_load_is_named(native_path, tmp_path):
     broken = tmp_path / "Broken.fmu"
     with zipfile.ZipFile(native_path) as archive, zipfile.ZipFile(broken, "w") as changed:
         for name in archive.namelist():
@@ -162,9 +151,7 @@ def test_an_fmu_that_workers_cannot_load_is_named(native_path: Path, tmp_path: P
 
 
 @pytest.mark.long
-def test_workers_that_are_killed_cost_no_run(
-    native_path: Path, length: Callable[[int, int], int], started: Callable[[], list[int]]
-) -> None:
+def test_workers_that_are_killed_cost_no_run(native_path, length, started):
     runs, pause, part = length(2000, 400), length(5, 0), length(1, 30)
     most = length(1000, MOST_DEATHS - 1)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
@@ -219,7 +206,7 @@ def asleep(fmu_path: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str]
         process.communicate()
 
 
-def test_a_signal_ends_a_sweep_in_the_midst_of_a_long_run(fmu_path: Path, tmp_path: Path) -> None:
+def test_a_signal_ends_a_sweep_in_the_midst_of_a_long_run(fmu_path, tmp_path):
     """Finished runs are stored, and no process is left."""
     with asleep(fmu_path, tmp_path) as (process, workers):
         process.send_signal(signal.SIGINT)
@@ -231,7 +218,7 @@ def test_a_signal_ends_a_sweep_in_the_midst_of_a_long_run(fmu_path: Path, tmp_pa
     assert len(workers) == 1 and not lives(workers[0])
 
 
-def test_workers_end_with_the_sweep_whatever_they_are_at(fmu_path: Path, tmp_path: Path) -> None:
+def test_workers_end_with_the_sweep_whatever_they_are_at(fmu_path, tmp_path):
     with asleep(fmu_path, tmp_path) as (process, workers):
         process.kill()
         process.communicate()
@@ -239,9 +226,7 @@ def test_workers_end_with_the_sweep_whatever_they_are_at(fmu_path: Path, tmp_pat
         wait_until(lambda: not lives(workers[0]))
 
 
-def test_a_sweep_can_be_stopped_while_its_workers_start(
-    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callable[[], list[int]]
-) -> None:
+def test_a_sweep_can_be_stopped_while_its_workers_start(native_path, tmp_path, monkeypatch, started):
     (tmp_path / "numpy.py").write_text("import time; time.sleep(1e6)")
     monkeypatch.syspath_prepend(tmp_path)
     table = sweep(native_path, grid={"Kp": [1.0, 2.0]}, output=tmp_path / "s", stop=asked(5))
@@ -249,7 +234,7 @@ def test_a_sweep_can_be_stopped_while_its_workers_start(
     assert started() == []
 
 
-def test_a_sweep_can_be_stopped_while_a_scheduler_does_not_answer(native_path: Path) -> None:
+def test_a_sweep_can_be_stopped_while_a_scheduler_does_not_answer(native_path):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         table = sweep(native_path, grid={"Kp": [1.0]}, scheduler=address, stop=asked(5))
@@ -290,7 +275,7 @@ def cluster(folder: Path, workers: int, options: Sequence[str] = (), **environme
         wait_until(lambda: not any(map(lives, children)))  # their trackers then remove their semaphores
 
 
-def test_a_cluster_that_asks_for_keys(native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_asks_for_keys(native_path, tmp_path, monkeypatch):
     """By Dask's own configuration; who has none is not let in."""
     key, certificate = str(tmp_path / "key.pem"), str(tmp_path / "certificate.pem")
     subprocess.run(
@@ -337,7 +322,7 @@ def test_a_cluster_that_asks_for_keys(native_path: Path, tmp_path: Path, monkeyp
 
 
 @pytest.fixture(scope="module")
-def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int, Path]]:
+def two_workers(tmp_path_factory):
     """Address and process of a scheduler, and a file in which runs are told that are begun."""
     folder = tmp_path_factory.mktemp("cluster")
     variables = {"BEGUN": str(folder / "begun"), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
@@ -345,16 +330,14 @@ def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str,
         yield address, scheduler, folder / "begun"
 
 
-def test_a_cluster_gives_the_table_of_local_workers(native_path: Path, two_workers: tuple[str, int, Path]) -> None:
+def test_a_cluster_gives_the_table_of_local_workers(native_path, two_workers):
     grid: dict[str, Iterable[float]] = {"Kp": np.linspace(10.0, 200.0, 30), "Kd": [10.0, 40.0]}
     expected = sweep(native_path, grid=grid)
     for _ in range(2):  # the workers stay, and nothing of a sweep stays with them
         same(sweep(native_path, grid=grid, scheduler=two_workers[0]), expected)
 
 
-def test_a_run_that_kills_is_given_up_by_a_cluster(
-    fmu_path: Path, tmp_path: Path, two_workers: tuple[str, int, Path]
-) -> None:
+def test_a_run_that_kills_is_given_up_by_a_cluster(fmu_path, tmp_path, two_workers):
     """And not what its worker has in hand beside it, of which Dask thinks no better."""
     fmu = changed_step(fmu_path, tmp_path, BEGUN)
     address, _, begun = two_workers
@@ -364,9 +347,7 @@ def test_a_run_that_kills_is_given_up_by_a_cluster(
     assert begun.read_text().split().count("300") == 3
 
 
-def test_a_sweep_can_be_stopped_when_its_scheduler_is_suspended(
-    native_path: Path, two_workers: tuple[str, int, Path]
-) -> None:
+def test_a_sweep_can_be_stopped_when_its_scheduler_is_suspended(native_path, two_workers):
     address, scheduler, _ = two_workers
     suspended: list[int] = []
     looks = asked(5)
@@ -399,7 +380,7 @@ sys.meta_path.insert(0, Blocker())
 """
 
 
-def test_workers_without_the_package_are_named(native_path: Path, tmp_path: Path) -> None:
+def test_workers_without_the_package_are_named(native_path, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(BLOCK)
     with (
         cluster(tmp_path, 1, PYTHONPATH=str(tmp_path)) as (address, _),
@@ -408,6 +389,6 @@ def test_workers_without_the_package_are_named(native_path: Path, tmp_path: Path
         sweep(native_path, grid={"Kp": [1.0]}, scheduler=address)
 
 
-def test_a_scheduler_without_workers_is_named(native_path: Path, tmp_path: Path) -> None:
+def test_a_scheduler_without_workers_is_named(native_path, tmp_path):
     with cluster(tmp_path, 0) as (address, _), pytest.raises(TwoDofError, match="has no workers"):
         sweep(native_path, grid={"Kp": [1.0]}, scheduler=address)

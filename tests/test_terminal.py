@@ -1,7 +1,5 @@
 """Unusual command lines and streams get one line each; names contain no terminal commands."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -29,7 +27,7 @@ def run(*arguments: str | bytes, cwd: Path, shell: str = '"$@"', **variables: st
 
 
 @pytest.mark.parametrize("arguments", [["build", "-o--"], ["plot", "bag", "-o--"], ["run", "--set=--"]])
-def test_a_value_that_argparse_loses_is_refused(arguments: list[str], tmp_path: Path) -> None:
+def test_a_value_that_argparse_loses_is_refused(arguments, tmp_path):
     done = run(*arguments, cwd=tmp_path)
     (line,) = done.stderr.splitlines()
     option = arguments[-1][:-2].rstrip("=")
@@ -38,7 +36,7 @@ def test_a_value_that_argparse_loses_is_refused(arguments: list[str], tmp_path: 
 
 
 @pytest.mark.parametrize("verb", ["sweep", "info", "plot"])
-def test_a_sweep_whose_name_is_no_text_is_refused(verb: str, native_path: Path, tmp_path: Path) -> None:
+def test_a_sweep_whose_name_is_no_text_is_refused(verb, native_path, tmp_path):
     name = b"\xff\xfe"
     if verb == "sweep":
         arguments: list[str | bytes] = [verb, str(native_path), "--grid", "Kp=10:20:2", "-o", name]
@@ -53,7 +51,7 @@ def test_a_sweep_whose_name_is_no_text_is_refused(verb: str, native_path: Path, 
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
-def test_streams_that_are_closed_end_no_run(closed: str, native_path: Path, tmp_path: Path) -> None:
+def test_streams_that_are_closed_end_no_run(closed, native_path, tmp_path):
     """Nor is a file of the run taken for one of them."""
     command = ["run", str(native_path), "--stop-time", "0.1", "-o", "bag"]
     assert run(*command, cwd=tmp_path, shell=f'"$@" {closed}').returncode == 0
@@ -61,13 +59,13 @@ def test_streams_that_are_closed_end_no_run(closed: str, native_path: Path, tmp_
 
 
 @pytest.mark.parametrize("backend", ["module://a_package.that_is_not_here", "a name that matplotlib does not know"])
-def test_a_backend_of_matplotlib_that_is_not_here_ends_no_plot(backend: str, native_path: Path, tmp_path: Path) -> None:
+def test_a_backend_of_matplotlib_that_is_not_here_ends_no_plot(backend, native_path, tmp_path):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     done = run("plot", "bag", "-o", "plot.png", cwd=tmp_path, MPLBACKEND=backend)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_names_are_no_commands_to_the_terminal(native_path: Path, tmp_path: Path) -> None:
+def test_names_are_no_commands_to_the_terminal(native_path, tmp_path):
     """In what to type next, in warnings of matplotlib, and in errors of the command line."""
     name = f"bag {ESCAPES}"
     command = ["run", str(native_path), "--stop-time", "0.1", "-o", name]

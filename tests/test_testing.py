@@ -1,7 +1,5 @@
 """The pytest plugin and its assertions, in runs of pytest of their own."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re
@@ -18,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> dict[str, Path]:
+def runs(tmp_path_factory, native_path):
     """Bags of the default arm: one that settles, a slow one, and one with an external effort."""
     folder = tmp_path_factory.mktemp("runs")
     settings = {"good": {}, "slow": {"Kp": 5.0}, "pushed": {"tau_ext[1]": 1e-3}}
@@ -27,13 +25,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> dict[st
     return {name: folder / name for name in settings}
 
 
-def test_a_run_that_is_as_asserted_passes(runs: dict[str, Path]) -> None:
+def test_a_run_that_is_as_asserted_passes(runs):
     assert_settles(runs["good"], within=3.1)
     assert_within_limits(twodof.read_bag(runs["good"]))
     assert_equal(runs["good"], twodof.read_bag(runs["good"]), within=0.0)
 
 
-def test_settling_is_that_of_the_error(runs: dict[str, Path]) -> None:
+def test_settling_is_that_of_the_error(runs):
     """The time in the message is the last sample at which the distance exceeds 2 % of the first."""
     bag = twodof.read_bag(runs["good"])
     distance = ((bag.x - (0.2, 0.05)) ** 2).sum(axis=1) ** 0.5
@@ -48,7 +46,7 @@ def test_settling_is_that_of_the_error(runs: dict[str, Path]) -> None:
         assert_settles(slow, within=3.0)
 
 
-def test_a_limit_that_is_exceeded_is_named(tmp_path: Path, native_path: Path) -> None:
+def test_a_limit_that_is_exceeded_is_named(tmp_path, native_path):
     twodof.run(native_path, twodof.Bag(tmp_path / "fast"), stop_time=0.3, settings={"v_start": (0.0, 30.0)})
     bag = twodof.read_bag(tmp_path / "fast")
     limit = bag.setup.limits.velocity[1]
@@ -57,7 +55,7 @@ def test_a_limit_that_is_exceeded_is_named(tmp_path: Path, native_path: Path) ->
         assert_within_limits(bag)
 
 
-def test_a_deviation_is_named_with_its_time(runs: dict[str, Path]) -> None:
+def test_a_deviation_is_named_with_its_time(runs):
     good, pushed = (twodof.read_bag(runs[name]) for name in ("good", "pushed"))
     k = int((abs(good.q - pushed.q) > 1e-5).any(axis=1).argmax())
     i = int((abs(good.q - pushed.q)[k] > 1e-5).argmax())
@@ -66,7 +64,7 @@ def test_a_deviation_is_named_with_its_time(runs: dict[str, Path]) -> None:
         assert_equal(pushed, good, within=1e-5)
 
 
-def test_what_cannot_be_compared_fails(runs: dict[str, Path]) -> None:
+def test_what_cannot_be_compared_fails(runs):
     """A run without limits, a target or equal samples is not as asserted."""
     good = twodof.read_bag(runs["good"])
     unknown = dataclasses.replace(good, provenance={})
@@ -102,7 +100,7 @@ def pytest_of_a_user(folder: Path, *arguments: str) -> subprocess.CompletedProce
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path: Path, native_path: Path) -> None:
+def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path, native_path):
     (tmp_path / "test_arm.py").write_text(TEST.format(fmu=str(native_path)))
     done = pytest_of_a_user(tmp_path, "--twodof-report", "report")
     assert "1 failed, 1 passed" in done.stdout, done.stdout + done.stderr
@@ -112,7 +110,7 @@ def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path: Path, native_p
     assert plot.read_text().count("<polyline") == 1
 
 
-def test_the_plugin_imports_nothing_heavy(tmp_path: Path) -> None:
+def test_the_plugin_imports_nothing_heavy(tmp_path):
     (tmp_path / "test_light.py").write_text(
         "import sys\n\ndef test_light():\n    assert not {'numpy', 'fmpy', 'pinocchio', 'rosbags'} & {*sys.modules}\n"
     )

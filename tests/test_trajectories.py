@@ -4,8 +4,6 @@ Truths are SciPy's splines, and the exact answer of
 q̈ = c − Kd q̇ − Kp q to what is held over a step; the bags are rosbags' with its own definitions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -67,7 +65,7 @@ def write(path: Path, *commands: tuple[float, Any], topic: str = "/go") -> Path:
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def arm(tmp_path_factory):
     """The default arm under joint control."""
     path = tmp_path_factory.mktemp("joint") / "Joint.fmu"
     return twodof.build_fmu(path, twodof.FmuOptions(control="joint", native=True))
@@ -96,7 +94,7 @@ def spline(times: Sequence[float], points: Sequence[Any]) -> BPoly:
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_what_is_held_is_the_mean_of_a_spline(arm: Path, tmp_path: Path, parts: int) -> None:
+def test_what_is_held_is_the_mean_of_a_spline(arm, tmp_path, parts):
     """From rest, through three points at times of no step, to rest."""
     knots = [0.0, 0.333, 0.7, 1.111]
     numbers = np.random.default_rng(parts).normal(size=(4, 3, 2))
@@ -119,7 +117,7 @@ def test_what_is_held_is_the_mean_of_a_spline(arm: Path, tmp_path: Path, parts: 
     np.testing.assert_array_equal(table[-1], [numbers[-1, 0], (0, 0), (0, 0)])  # held to the bit
 
 
-def test_the_robot_does_exactly_what_is_held(arm: Path, tmp_path: Path) -> None:
+def test_the_robot_does_exactly_what_is_held(arm, tmp_path):
     """From off the trajectory, at each step, by ë + Kd ė + Kp e = c, which is constant in it."""
     bag = write(tmp_path / "bag", (0.0, trajectory([(0.0, *THERE), (1.0, *BACK), (1.5, *THERE)])))
     out, h = tmp_path / "model", 0.01
@@ -143,7 +141,7 @@ def test_the_robot_does_exactly_what_is_held(arm: Path, tmp_path: Path) -> None:
     assert np.abs(twodof.read_bag(out).q - q).max() < 1e-9
 
 
-def test_the_robot_stays_on_the_trajectory(arm: Path, tmp_path: Path) -> None:
+def test_the_robot_stays_on_the_trajectory(arm, tmp_path):
     """As what is held comes closer to what is wanted, with the square of the step."""
     near = ((0.52, 0.34), (0.0, 0.0), (0.0, 0.0))
     rest = (START, (0.0, 0.0), (0.0, 0.0))
@@ -161,7 +159,7 @@ def test_the_robot_stays_on_the_trajectory(arm: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(arm: Path, tmp_path: Path, parts: int) -> None:
+def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(arm, tmp_path, parts):
     """In its joints alone; between two points by what both have."""
     stops = [(START, (0.0, 0.0), (0.0, 0.0)), THERE, BACK, THERE, BACK, THERE, BACK]
     first = trajectory([(t, *stop) for t, stop in zip((1.0, 1.6, 1.7, 1.8, 1.9, 2.0), stops[1:])])
@@ -194,7 +192,7 @@ def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(arm: Path, tm
         (0.5, 0.0, [(0.0, (0.8,))], None),
     ],
 )
-def test_when_it_starts(arm: Path, tmp_path: Path, came: float, stamp: float, points: Any, path: BPoly | None) -> None:
+def test_when_it_starts(arm, tmp_path, came, stamp, points, path):
     begin = BEGIN + round(stamp * SECOND) if stamp else 0
     bag = write(tmp_path / "bag", (came, trajectory(points, ["joint1"], begin)))
     table = held(arm, bag, 0.01, 250)
@@ -206,7 +204,7 @@ def test_when_it_starts(arm: Path, tmp_path: Path, came: float, stamp: float, po
     assert (table[:, 0, 1] == 0.35).all() and (table[:, 1:, 1] == 0.0).all()
 
 
-def test_it_begins_where_the_run_does(arm: Path, tmp_path: Path) -> None:
+def test_it_begins_where_the_run_does(arm, tmp_path):
     bag = write(tmp_path / "bag", (1.0, trajectory([(1.0, (0.8,))], ["joint1"])))
     for settings in ({"q_start": (0.1, 0.2)}, {"q_start": 0.0, "q_des": (0.1, 0.2)}):
         table = held(arm, bag, 0.01, 151, settings=settings)
@@ -214,7 +212,7 @@ def test_it_begins_where_the_run_does(arm: Path, tmp_path: Path) -> None:
         assert table[150, 0] == pytest.approx([0.1 + 0.505 * 0.7, 0.2], abs=1e-12)
 
 
-def test_joints_of_another_robot_are_left_out(arm: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_joints_of_another_robot_are_left_out(arm, tmp_path, caplog):
     """Both a trajectory and a joint state may name them."""
     names, none = ["finger", "joint2", "elbow"], np.zeros(0)
     message = trajectory([(1.0, (0.1, 0.2, 0.3), (0.0, 0.5, 1.0))], names)
@@ -249,9 +247,7 @@ NAN = float("nan")
         (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp must be 0"),
     ],
 )
-def test_what_cannot_be_followed(
-    arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], message: Any, reason: str
-) -> None:
+def test_what_cannot_be_followed(arm, tmp_path, capfd, message, reason):
     bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *THERE)])), (0.5, message))
     assert main(["run", str(arm), "--input", f"{bag}:/go", "-o", str(tmp_path / "none")]) == 1
     (line,) = capfd.readouterr().err.splitlines()
@@ -267,9 +263,7 @@ def test_what_cannot_be_followed(
         (1e-9, ((1e300, 0.0), (0.0, 0.0), (0.0, 0.0)), "0.01", "is not finite"),
     ],
 )
-def test_what_would_have_no_end(
-    arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], after: float, there: Any, step: str, reason: str
-) -> None:
+def test_what_would_have_no_end(arm, tmp_path, capfd, after, there, step, reason):
     bag = write(tmp_path / "bag", (0.0, trajectory([(after, *there)])))
     given = ["--input", str(bag), "--step", step, "-o", str(tmp_path / "none")]
     assert main(["run", str(arm), *given]) == 1
@@ -278,7 +272,7 @@ def test_what_would_have_no_end(
 
 
 @pytest.mark.parametrize("control", ["effort", "task"])
-def test_another_control_follows_none(tmp_path: Path, capfd: pytest.CaptureFixture[str], control: str) -> None:
+def test_another_control_follows_none(tmp_path, capfd, control):
     bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *THERE)])))
     fmu = twodof.build_fmu(tmp_path / "Arm.fmu", twodof.FmuOptions(control=control))
     for given in (f"{bag}:/go", str(bag)):
@@ -287,7 +281,7 @@ def test_another_control_follows_none(tmp_path: Path, capfd: pytest.CaptureFixtu
         assert f"'{bag}' has no commands" in line and "for this FMU, which follows" in line
 
 
-def test_a_topic_of_two_types_is_refused(arm: Path, tmp_path: Path) -> None:
+def test_a_topic_of_two_types_is_refused(arm, tmp_path):
     state = HUMBLE.types[JOINT_STATE](trajectory([]).header, ["joint1"], np.zeros(1), np.zeros(0), np.zeros(0))
     both = [(0.0, trajectory([(1.0, *THERE)])), (0.5, state)]
     for name, commands in (("a", both), ("b", [(0.0, state), (0.5, both[0][1])])):

@@ -1,7 +1,5 @@
 """The replay of a bag in a browser, compared with the bag as MCAP's own reader reads it."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -10,7 +8,7 @@ import shutil
 import socket
 import time as clock
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +18,6 @@ import oracles
 import pytest
 from browser import (
     LINKS,
-    Served,
     answer,
     area,
     at_rest,
@@ -40,7 +37,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Page
 
 import twodof
 from twodof.cli.main import main
@@ -51,13 +48,13 @@ TARGETS = ((0.2, 0.05), (0.1, 0.2))
 
 
 @pytest.fixture(scope="module")
-def shown() -> Iterator[Browser]:
+def shown():
     with chromium() as program:
         yield program
 
 
 @pytest.fixture(scope="module")
-def folder(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(native_path, tmp_path_factory):
     """A folder with an FMU and the bag of a run whose target changes."""
     folder = tmp_path_factory.mktemp("view")
     fmu = folder / native_path.name
@@ -70,19 +67,19 @@ def folder(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def command(folder: Path) -> Iterator[Served]:
+def command(folder):
     with served("view", "bag", cwd=folder) as command:
         yield command
 
 
 @pytest.fixture(scope="module")
-def page(shown: Browser, command: Served) -> Iterator[Page]:
+def page(shown, command):
     with opened(shown, command.url) as page:
         yield page
 
 
 @pytest.fixture(scope="module")
-def truth(folder: Path) -> np.ndarray:
+def truth(folder):
     """Time and joint positions of each sample, by another reader."""
     with (folder / "bag/bag.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -111,7 +108,7 @@ def scrub(page: Page, time: float) -> dict[str, str]:
     return until(page, lambda found: found["time"] == f"{time:.3f} s")
 
 
-def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: np.ndarray) -> None:
+def test_page_plays_and_scrubbing_lands_on_the_right_sample(page, truth):
     until(page, lambda found: numbers(found["time"])[0] > 0.0)
     pictures = []
     for time in (1.23, 0.05, 3.99):
@@ -147,7 +144,7 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     assert until(page, lambda found: numbers(found["time"])[0] == pytest.approx(paused.expected + 0.01))
 
 
-def test_the_end_is_the_end_or_the_beginning(page: Page) -> None:
+def test_the_end_is_the_end_or_the_beginning(page):
     scrub(page, 3.8)
     press(page, "Play")
     until(page, lambda found: found["sample"] == "400 of 400")
@@ -164,7 +161,7 @@ def test_the_end_is_the_end_or_the_beginning(page: Page) -> None:
     page.get_by_label("loop").uncheck()
 
 
-def test_the_view_is_brought_back(page: Page) -> None:
+def test_the_view_is_brought_back(page):
     scrub(page, 1.0)
     page.locator("#arm-scene").focus()
     page.keyboard.press("Home")
@@ -181,7 +178,7 @@ def test_the_view_is_brought_back(page: Page) -> None:
     until(page, lambda shot: change(shot) < 0.1 * zoomed, picture)
 
 
-def test_speed_is_that_of_the_wall_clock(page: Page, speed: float = 0.25) -> None:
+def test_speed_is_that_of_the_wall_clock(page, speed=0.25):
     """Told from those of half and of twice as much, once a busy machine shows it in time."""
     page.get_by_label("speed").select_option(f"{speed:g}")
     shown: list[float] = []
@@ -205,7 +202,7 @@ def slope(page: Page) -> float:
     return float(np.polyfit(passed, told, 1)[0])
 
 
-def test_curves_are_the_bag_with_a_mark_at_the_time(page: Page, truth: np.ndarray) -> None:
+def test_curves_are_the_bag_with_a_mark_at_the_time(page, truth):
     np.testing.assert_array_equal(browser.samples(page)[:, :3], truth)
     marks = []
     for time in (0.6, 1.7, 3.4):  # where no line of the grid is
@@ -235,13 +232,13 @@ MARK = """(canvas) => {
 
 @given(st.lists(st.floats(-1, 5), min_size=1, max_size=50))
 @settings(max_examples=20, deadline=None)
-def test_nearest_is_nearest(page: Page, truth: np.ndarray, times: list[float]) -> None:
+def test_nearest_is_nearest(page, truth, times):
     nearest = page.evaluate("(times) => times.map((t) => arm.nearest(t))", times)
     least = np.abs(truth[:, [0]] - times).min(axis=0)
     assert np.abs(truth[nearest, 0] - times) == pytest.approx(least, abs=1e-12)
 
 
-def test_twenty_visits_leak_nothing(command: Served, page: Page) -> None:
+def test_twenty_visits_leak_nothing(command, page):
     """Threads and memory are as they were after the first few."""
     for i in range(25):
         assert answer(command.url, ("Host", "localhost")) == 200
@@ -251,7 +248,7 @@ def test_twenty_visits_leak_nothing(command: Served, page: Page) -> None:
     assert command.status("VmRSS") <= memory + 10_000  # KiB
 
 
-def test_exported_file_replays_offline(shown: Browser, folder: Path, truth: np.ndarray, run_view: View) -> None:
+def test_exported_file_replays_offline(shown, folder, truth, run_view):
     """Each picture is the arm at that moment of the bag; and it is all of the page."""
     done = run_view("bag", "--export", "replay.html", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
@@ -301,7 +298,7 @@ def assert_on_one_arm(system: np.ndarray, middles: np.ndarray) -> None:
     assert min(fitted[2:]) > 0.0 and np.abs(system @ fitted - middles).max() < 1.5  # pixels
 
 
-def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(shown: Browser, folder: Path, tmp_path: Path) -> None:
+def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(shown, folder, tmp_path):
     bag = tmp_path / "foreign"
     bag.mkdir()
     for file in (folder / "bag").iterdir():
@@ -326,7 +323,7 @@ View = Callable[..., Done]
 
 
 @pytest.fixture
-def run_view(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> View:
+def run_view(monkeypatch, capsys):
     """``twodof view`` in a folder."""
 
     def run(*arguments: str | Path, cwd: Path) -> Done:
@@ -339,7 +336,7 @@ def run_view(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def painted(folder: Path) -> Path:
+def painted(folder):
     """A folder with the bag of a robot whose meshes, magenta, are elsewhere."""
     root = Path(__file__).parents[1]
     shutil.copytree(root / "meshes", folder / "packages/painted")
@@ -358,9 +355,7 @@ def painted(folder: Path) -> Path:
 @pytest.mark.parametrize(
     "options", [["--fmu", "made/painted.fmu"], ["--urdf", "painted.urdf", "--mesh-dir", "packages"]]
 )
-def test_meshes_are_found_where_they_are_said_to_be(
-    shown: Browser, folder: Path, painted: Path, run_view: View, options: list[str]
-) -> None:
+def test_meshes_are_found_where_they_are_said_to_be(shown, folder, painted, run_view, options):
     done = run_view(painted / "bag", *options, "--export", "painted.html", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
     with opened(shown, (folder / "painted.html").as_uri()) as page:
@@ -371,7 +366,7 @@ def magenta(r: np.ndarray, g: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (r > 150) & (g < 60) & (b > 150)
 
 
-def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path, run_view: View) -> None:
+def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted, run_view):
     done = run_view("bag", "--export", "sticks.html", cwd=painted)
     assert done.returncode == 0
     assert re.fullmatch(
@@ -387,7 +382,7 @@ def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path, run_view: 
 
 
 @pytest.fixture(scope="module")
-def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hostile(tmp_path_factory):
     """A bag all of whose texts are hostile."""
     folder, robot = tmp_path_factory.mktemp("hostile"), browser.hostile_arm()
     (folder / "arm.urdf").write_bytes(ET.tostring(robot))
@@ -407,7 +402,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bag
 
 
-def test_text_of_a_bag_is_text(shown: Browser, hostile: Path, run_view: View) -> None:
+def test_text_of_a_bag_is_text(shown, hostile, run_view):
     done = run_view(hostile.name, "--export", "hostile.html", cwd=hostile.parent)
     assert done.returncode == 0
     with opened(shown, (hostile.parent / "hostile.html").as_uri()) as page:
@@ -415,7 +410,7 @@ def test_text_of_a_bag_is_text(shown: Browser, hostile: Path, run_view: View) ->
         assert page.title() == f"{browser.HOSTILE}2dof - {hostile.name} - twodof"
 
 
-def test_bag_whose_name_is_no_text_is_shown(folder: Path, tmp_path: Path, run_view: View) -> None:
+def test_bag_whose_name_is_no_text_is_shown(folder, tmp_path, run_view):
     name = os.fsdecode(b"bag\xff")
     shutil.copytree(folder / "bag", tmp_path / name)
     assert run_view(name, "--export", "bag.html", cwd=tmp_path).returncode == 0
@@ -436,7 +431,7 @@ def test_bag_whose_name_is_no_text_is_shown(folder: Path, tmp_path: Path, run_vi
         '<geometry><box/></geometry><material name="red"><color rgba="1"/></material>',
     ],
 )
-def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path: Path, run_view: View) -> None:
+def test_shape_without_numbers_gets_one_line(shape, folder, tmp_path, run_view):
     shutil.copytree(folder / "bag", tmp_path / "bag")
     made = json.loads((tmp_path / "bag/run.json").read_text())
     made["urdf"] = made["urdf"].replace("<visual>", f"<visual>{shape}</visual><visual>", 1)
@@ -446,7 +441,7 @@ def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path:
     assert re.fullmatch(r"twodof: error: [^\n]*link 'link1'[^\n]+\n", done.stderr)
 
 
-def test_port_in_use(folder: Path, run_view: View) -> None:
+def test_port_in_use(folder, run_view):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = run_view("bag", "--port", f"{port}", cwd=folder)
@@ -469,7 +464,7 @@ def test_port_in_use(folder: Path, run_view: View) -> None:
         (["bag", "--export", "no/where.html"], "cannot write 'no/where.html'"),
     ],
 )
-def test_bad_input_gets_one_line(arguments: list[str], said: str, folder: Path, run_view: View) -> None:
+def test_bad_input_gets_one_line(arguments, said, folder, run_view):
     urdf = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text()
     (folder / "other.urdf").write_text(urdf.replace('"joint1"', '"shoulder"'))
     port = () if "--export" in arguments else ("--port", "0")
