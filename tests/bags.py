@@ -130,6 +130,12 @@ class JointState(NamedTuple):
     effort: bytes
 
 
+@pytest.fixture(scope="session")
+def run(native_path: Path) -> Experiment:
+    """The default experiment of the default arm."""
+    return twodof.experiment(native_path)
+
+
 def sample(run: Experiment, k: int) -> Sample:
     """A sample that no simulation gave, told apart by its numbers."""
     inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from bags import run as run
 from nodes import listen as listen
 from nodes import number as number
 from nodes import program as program

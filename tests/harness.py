@@ -76,6 +76,12 @@ def lasting(method):
     return LOGGERS[-1]
 
 
+def python(*arguments, check=False, timeout=300, **options):
+    """Run Python with arguments, and return the process with its output as text."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=check, timeout=timeout, **options)
+
+
 class Worker:
     """A process for many calls; a call that ends it or hangs fails, and the next has a new one."""
 

@@ -80,11 +80,6 @@ def recording(native_path, tmp_path_factory):
     return recording
 
 
-@pytest.fixture(scope="module")
-def run(native_path):
-    return twodof.experiment(native_path)
-
-
 # --- messages ---
 
 

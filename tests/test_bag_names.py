@@ -1,20 +1,14 @@
 """Bags whose names are not plain text: read, or refused before they are written."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from bags import assert_consistent, content, sample, unfinished
+from harness import python
 
 import twodof
 from twodof.errors import BagError
-
-
-@pytest.fixture(scope="module")
-def run(native_path):
-    return twodof.experiment(native_path)
 
 
 def renamed(bag: Path, name: bytes) -> Path:
@@ -54,7 +48,6 @@ def test_bag_of_a_name_that_is_not_utf8_is_read(run, tmp_path, verb):
             sink.write(sample(run, k))
     bag = renamed(sink.path, b"\xff")
     options = ["-o", "x.svg"] if verb == "plot" else []
-    command: list[str | bytes] = [sys.executable, "-m", "twodof", verb, os.fsencode(bag), *options]
     terminal = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=terminal)
+    done = python("-m", "twodof", verb, os.fsencode(bag), *options, cwd=tmp_path, env=terminal)
     assert (done.returncode, done.stderr) == (0, "")

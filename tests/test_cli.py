@@ -13,6 +13,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
+from harness import python
 
 import twodof
 from twodof.cli.help import EXAMPLES
@@ -25,7 +26,7 @@ RUN = ["run", "arm.fmu", "-o", "out", "--stop-time", "0.02"]
 
 def twodof_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own."""
-    return subprocess.run([*COMMAND, *arguments], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    return python("-m", "twodof", *arguments, cwd=cwd, env=ENVIRONMENT)
 
 
 @pytest.fixture(scope="module")
@@ -99,14 +100,9 @@ def test_what_is_suggested_can_be_typed(activated, missing, native_path, tmp_pat
     spec = f"import importlib.util as u; f = u.find_spec; absent = {missing!r}; "
     spec += "u.find_spec = lambda n, *a: None if n in absent else f(n, *a); "
     code = f"{spec}import sys; from twodof.__main__ import main; sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "run", str(native_path), "--stop-time", "0.1", "-o", "bag"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PATH": os.pathsep.join([here] * activated + path)},
-    )
+    run = ["run", native_path, "--stop-time", "0.1", "-o", "bag"]
+    environment = {**os.environ, "PATH": os.pathsep.join([here] * activated + path)}
+    done = python("-c", code, *run, cwd=tmp_path, check=True, env=environment)
     following = done.stdout.partition("\nnext\n")[2]
     program = "twodof" if activated else f"{here}/twodof"
     commands = [line.strip() for line in following.partition("\n\n")[0].splitlines()]
@@ -323,19 +319,9 @@ def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_pa
         f"twodof plot {tmp_path / 'bag'} --joints jo": ["joint1", "joint2"],
         f"twodof plot {tmp_path / 'bag'} --frame li": ["link1", "link2"],
     }.items():
-        subprocess.run(
-            [sys.executable, "-m", "twodof"],
-            env={
-                **os.environ,
-                "_ARGCOMPLETE": "1",
-                "_ARGCOMPLETE_IFS": "\n",
-                "COMP_LINE": line,
-                "COMP_POINT": str(len(line)),
-                "_ARGCOMPLETE_STDOUT_FILENAME": str(answer),
-                "COMP_TYPE": "9",
-            },
-            check=True,
-        )
+        shell = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(answer)}
+        shell |= {"COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
+        python("-m", "twodof", env={**os.environ, **shell}, check=True)
         assert {word.strip() for word in answer.read_text().split("\n")} == {*expected}, line
 
 
@@ -353,15 +339,10 @@ def test_the_examples_of_each_help_are_commands(verb):
 def test_a_compiler_that_works_is_seen_working(tmp_path):
     """A line within a second, seconds on a terminal, and at the end a line that is clear."""
     code = "import time; from twodof.cli.printing import busy\nwith busy('compiling'): time.sleep(1.7)"
-    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    done = python("-c", code, env=ENVIRONMENT, check=True)
     assert done.stderr == "compiling …\n"
-    shown = subprocess.run(
-        ["script", "-qec", shlex.join([sys.executable, "-c", code]), "/dev/null"],
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    terminal = ["script", "-qec", shlex.join([sys.executable, "-c", code]), "/dev/null"]
+    shown = subprocess.run(terminal, env=ENVIRONMENT, capture_output=True, text=True, check=True)
     seconds = [*map(int, re.findall(r"compiling: (\d+) s", shown.stdout))]
     assert len(seconds) > 1 and seconds == sorted(seconds) and seconds[-1] >= 1
     assert shown.stdout.endswith("\x1b[K")

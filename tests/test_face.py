@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas
 import pytest
+from harness import python
 
 import twodof
 from twodof.version import versions
@@ -218,13 +219,7 @@ def test_recording_has_what_the_samples_had(native_path, tmp_path):
 
 def program(names: list[str], code: str, folder: Path, *arguments: object) -> str:
     """Run code where these modules cannot be imported; what it says."""
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT.format(names=names) + code, *map(str, arguments)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-c", WITHOUT.format(names=names) + code, *arguments, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -28,12 +28,6 @@ from twodof.bag.provenance import MAX_TAIL
 from twodof.pages.loop import Loop
 from twodof.plots.track import read_tracks
 
-
-@pytest.fixture(scope="module")
-def run(native_path):
-    return twodof.experiment(native_path)
-
-
 TARGETS = {0: (0.22, 0.08), 20: (0.15, 0.1), 45: (0.1, 0.2)}  # by the step that they hold from
 STEPS = 80
 

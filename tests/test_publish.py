@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
-from harness import wait_until
+from harness import python, wait_until
 from nodes import CABLE, COMMANDS, LATCHED, STREAMS, ended, environment, isolated, published, recorded, stamp_of
 
 import twodof
@@ -363,15 +363,8 @@ def test_an_hour_has_flat_memory(native_path, number, listen, length):
     """Seconds without pace; in full, an hour in real time."""
     steps = length(360_000, 5_000)
     listen("/joint_states", "/tf", "/robot_description")
-    command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
-    done = subprocess.run(
-        [*command, "paced" if steps == 360_000 else ""],
-        cwd=Path(__file__).parent,
-        env=environment(number),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    arguments, paced = ["-c", MEMORY, native_path, str(steps)], "paced" if steps == 360_000 else ""
+    done = python(*arguments, paced, cwd=Path(__file__).parent, env=environment(number), check=True, timeout=7200)
     print(f"{steps} samples: memory grew by {int(done.stdout) / 2**20:.1f} MiB")
     assert int(done.stdout) <= min(10e6, 250 * steps)
 

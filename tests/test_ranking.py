@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from native_models import robots_folder
 from scipy.spatial.transform import Rotation
+from sinks import Collector
 
 import twodof
 from twodof.cli.main import main
@@ -50,24 +51,16 @@ def limits(quantity: str) -> np.ndarray:
     return np.array([float(limit.attrib[quantity]) for limit in found if limit is not None])
 
 
-class Kept(twodof.Sink):
-    def __init__(self) -> None:
-        self.samples: list[twodof.Sample] = []
-
-    def write(self, sample: twodof.Sample) -> None:
-        self.samples.append(sample)
-
-
 @pytest.mark.parametrize("count", [3, 5000])
 def test_a_summary_has_the_errors_of_all_that_is_controlled(ur5, count):
-    kept = Kept()
+    kept = Collector()
     settings = {"quat_des": GOAL, "Kp": 400.0, "Kp_rot": 400.0}
     run = twodof.simulate(ur5["pose"], kept, settings=settings, step=0.002, stop_time=0.002 * count)
-    last = kept.samples[-1]
+    last = kept[-1]
     apart = Rotation.from_quat(last.quat).inv() * Rotation.from_quat(GOAL)
     assert run.turn_error == pytest.approx(apart.magnitude(), abs=1e-12)
     assert run.joint_error is None
-    peaks = np.abs([[*sample.tau, *sample.v] for sample in kept.samples]).max(axis=0)
+    peaks = np.abs([[*sample.tau, *sample.v] for sample in kept]).max(axis=0)
     share = peaks / [*limits("effort"), *limits("velocity")]
     kinds = [(kind, joint) for kind in ("effort", "velocity") for joint in twodof.load_fmu(ur5["pose"]).joints]
     beyond = {of: pytest.approx(use, rel=1e-12) for use, of in zip(share, kinds) if use > 1.0}

@@ -7,8 +7,6 @@ import shutil
 import signal
 import sqlite3
 import struct
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -39,6 +37,7 @@ from bags import (
     texts,
     unfinished,
 )
+from harness import python
 from mcap.exceptions import McapError
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -50,11 +49,6 @@ from twodof.cli.main import main
 from twodof.errors import BagError
 
 PAGE = 4096  # bytes, of SQLite
-
-
-@pytest.fixture(scope="module")
-def run(native_path):
-    return twodof.experiment(native_path)
 
 
 def streamed(file: Path) -> int:
@@ -452,8 +446,7 @@ def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(run, 
     bags = [tmp_path / str(last) / "bag" for last in range(9)]
     for bag in bags:
         shutil.copytree(living, bag)
-    command = [sys.executable, "-c", KILLED_ANYWHERE, *map(str, bags)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = python("-c", KILLED_ANYWHERE, *bags, check=True)
     ends = [int(line) for line in done.stdout.split()]
     assert {*ends[:5]} == {-signal.SIGKILL} and ends[-1] == 0
     gone = 0

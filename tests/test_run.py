@@ -3,8 +3,9 @@
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
+
+from harness import python
 
 HERE = Path(__file__).parent
 CONFTEST = """
@@ -38,15 +39,7 @@ def ran(folder: Path, text: str, *options: str, ci: str = "") -> subprocess.Comp
         "PYTHONPATH": str(HERE),
         "CI": ci,
     }
-    return subprocess.run(
-        [sys.executable, "-m", "pytest", *options, str(folder)],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    return python("-m", "pytest", *options, folder, cwd=folder, env=environment)
 
 
 def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path):

@@ -6,7 +6,6 @@ import random
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +18,7 @@ import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from harness import python
 from tables import COMMAND, SMALL, same, table_of
 
 import twodof
@@ -251,14 +251,8 @@ if __name__ == "__main__":
     print(late[0][1], max(row[2] for row in late) - late[0][2], seen[-1][2] - seen[1][2])
 """
     runs = length(10_000, 5_000)
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(native_path), str(tmp_path / "s"), str(runs)],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=500,
-    )
+    here = Path(__file__).parent
+    done = python("-c", code, native_path, tmp_path / "s", str(runs), cwd=here, check=True, timeout=500)
     first, growth, all_growth = map(float, done.stdout.split())
     print(f"coordinator: {growth:.1f} MiB from run {first:.0f} to {runs}; {all_growth:.1f} in all")
     assert first < 0.9 * runs

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import asked, changed_step, children_of, lives, wait_until
+from harness import asked, changed_step, children_of, lives, python, wait_until
 from tables import BEGUN, COMMAND, same, table_of
 from tools import needs
 
@@ -95,15 +95,7 @@ assert not {"dask", "distributed"} & {*sys.modules}
 def test_workers_import_nothing_from_the_working_directory(way, variables, native_path, tmp_path):
     """Nor the program itself, which shields nothing by ``if __name__ == "__main__"``."""
     (tmp_path / "program.py").write_text(PROGRAM)
-    done = subprocess.run(
-        [sys.executable, *way, str(Path(__file__).parent), str(native_path)],
-        cwd=tmp_path,
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    done = python(*way, Path(__file__).parent, native_path, cwd=tmp_path, env={**os.environ, **variables})
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "numpy.py").exists() and not list(tmp_path.glob("*.sprung"))
 
@@ -114,14 +106,7 @@ def test_workers_run_the_package_that_the_program_runs(native_path, tmp_path):
     with (tmp_path / "twodof/simulation/judge.py").open("a") as file:
         file.write("Judge.metrics = lambda judge: {'overshoot': 17.0}\n")
     code = "import sys, twodof; print(*twodof.sweep(sys.argv[1], grid={'Kp': [9.0]})['overshoot'])"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(native_path)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    done = python("-c", code, native_path, cwd=tmp_path)
     assert (done.stdout, done.stderr) == ("17.0\n", "")
 
 
@@ -278,26 +263,9 @@ def cluster(folder: Path, workers: int, options: Sequence[str] = (), **environme
 def test_a_cluster_that_asks_for_keys(native_path, tmp_path, monkeypatch):
     """By Dask's own configuration; who has none is not let in."""
     key, certificate = str(tmp_path / "key.pem"), str(tmp_path / "certificate.pem")
-    subprocess.run(
-        [
-            needs("openssl"),
-            "req",
-            "-x509",
-            "-newkey",
-            "rsa:2048",
-            "-nodes",
-            "-subj",
-            "/CN=cluster",
-            "-days",
-            "2",
-            "-keyout",
-            key,
-            "-out",
-            certificate,
-        ],
-        check=True,
-        capture_output=True,
-    )
+    request = ["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=cluster", "-days", "2"]
+    command = [needs("openssl"), *request, "-keyout", key, "-out", certificate]
+    subprocess.run(command, check=True, capture_output=True)
     monkeypatch.setattr("twodof.sweeps.cluster.SCHEDULER_TIMEOUT", 2.0)
     names = (("--tls-ca-file", certificate), ("--tls-cert", certificate), ("--tls-key", key))
     options = ["--protocol", "tls", *(word for pair in names for word in pair)]
@@ -306,14 +274,8 @@ def test_a_cluster_that_asks_for_keys(native_path, tmp_path, monkeypatch):
     grid = {"Kp": [20.0, 60.0]}
     with cluster(tmp_path, 1, options) as (address, _):
         assert address.startswith("tls://")
-        command = ["sweep", str(native_path), "--grid", "Kp=20:60:2", "--scheduler", address]
-        done = subprocess.run(
-            [*COMMAND, *command, "-o", str(tmp_path / "s")],
-            env={**os.environ, **keys},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        command = ["sweep", native_path, "--grid", "Kp=20:60:2", "--scheduler", address, "-o", tmp_path / "s"]
+        done = python("-m", "twodof", *command, env={**os.environ, **keys})
         assert (done.returncode, done.stderr) == (0, "")
         same(table_of(tmp_path / "s"), sweep(native_path, grid=grid))
         for stranger in (address, address.replace("tls", "tcp")):

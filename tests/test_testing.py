@@ -4,10 +4,10 @@ import dataclasses
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from harness import python
 
 import twodof
 from twodof.testing import assert_equal, assert_settles, assert_within_limits
@@ -94,10 +94,9 @@ def test_late(run_fmu):
 
 
 def pytest_of_a_user(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-p", "twodof.testing.plugin", "-p", "no:cacheprovider", *arguments]
-    command += ["--basetemp", str(folder / "temporary")]
+    options = ["-p", "twodof.testing.plugin", "-p", "no:cacheprovider", "--basetemp", folder / "temporary"]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return python("-m", "pytest", *arguments, *options, cwd=folder, env=environment)
 
 
 def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path, native_path):
