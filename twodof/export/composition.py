@@ -84,6 +84,11 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     return flavour, files, finish
 
 
+def fmi_version(options: FmuOptions) -> int:
+    """Return a native FMU's version of FMI; by default 2, or 3 if FMI 2.0 has no name for this machine."""
+    return options.fmi or (2 if options.platforms or host_platform() else 3)
+
+
 def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Starts) -> Flavour:
     if not options.native:
         if options.platforms or options.fmi not in (None, 2) or not options.arrays:
@@ -94,7 +99,7 @@ def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str
         return python_flavour(options, robot, urdf, starts)
     if options.link_environment:
         raise BuildError("a native FMU needs no Python environment; leave out `link_environment=True`")
-    fmi = options.fmi or (2 if options.platforms or host_platform() else 3)
+    fmi = fmi_version(options)
     if fmi not in PLATFORMS:
         raise BuildError(f"`fmi` {fmi} must be 2 or 3")
     platforms = options.platforms or (host_platform(fmi),)

@@ -31,7 +31,7 @@ class FmuOptions:
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".
         part: "all"; "controller": the control law alone, native, with inputs q and v and outputs tau_cmd; or "split":
-            a system of plant and controller, two native FMUs of FMI 2.0 in an SSP file.
+            a system of plant and controller, two native FMUs in an SSP file.
         name: model name and identifier; "": name of the URDF's file, "TwoDof" for the shipped arm.
         link_environment: store the folders of this Python's packages in the FMU; not for the native
             flavour, which needs no Python.
@@ -76,8 +76,8 @@ class FmuOptions:
             raise BuildError(f"`lock` is {self.lock!r:.50}; give positions by joint, as {{'joint1': 0.0}}")
         if self.part not in ("all", "controller", "split"):
             raise BuildError(f"`part` '{self.part}' is unknown; it is 'all', 'controller' or 'split'")
-        if self.part == "split" and (self.fmi == 3 or self.control == "effort"):
-            raise BuildError("a split robot has FMUs of FMI 2.0, `fmi=2`, and a control law other than 'effort'")
+        if self.part == "split" and self.control == "effort":
+            raise BuildError("a split robot has a control law other than 'effort', which is the plant alone")
         if self.part != "all" and self.reference:
             raise BuildError("reference trajectories are of the robot under its control law; leave out `reference`")
         if self.part == "controller" and (not self.native or self.control == "effort"):

@@ -6,14 +6,15 @@ Source: System Structure and Parameterization 1.0, Modelica Association, 2019.
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 from ..plant.variables import CONTROLS
 from ..version import __version__
-from .composition import compose
+from .composition import compose, fmi_version
 from .flavours import Files
 from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
-from .model_description import SENSORS
+from .model_description import FMI3_TYPES, SENSORS
 
 SSP = "http://ssp-standard.org/SSP1/SystemStructure"
 SSC, SSD, SSV = (f"{{{SSP}{name}}}" for name in ("Common", "Description", "ParameterValues"))
@@ -25,11 +26,26 @@ WIRES = (
 """Connections: component and group of the start, and those of the end."""
 
 
+class Row(NamedTuple):
+    """A variable's causality, its type in SSP 1.0, and its start value as text."""
+
+    causality: str
+    type: str
+    start: str | None
+
+    @classmethod
+    def of(cls, variable: ET.Element) -> "Row":
+        """Return the row of a variable of FMI 2.0, whose type is a child, or of FMI 3.0."""
+        typed = next(iter(variable), variable)
+        kind = next((two for two, three in FMI3_TYPES.items() if three == typed.tag), typed.tag)
+        return cls(variable.get("causality", ""), kind, typed.get("start"))
+
+
 def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
     """Return the files of an SSP except its FMUs, and the files of each FMU by its path in the SSP.
 
     The plant has the start values of the robot. The controller has those of the control law, its sampling and sensors.
-    Common start values are set in both.
+    Common start values are set in both. Vectors of FMI 3.0 are scalars, because SSP 1.0 has no arrays.
 
     Raises:
         BuildError, RobotError: the message names the culprit.
@@ -37,7 +53,8 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
     law = CONTROLS[options.control]
     of_law = {*law.inputs, *law.parameters, *SENSORS, "control_period", "control_delay"}
     of_plant = {name: value for name, value in options.settings.items() if name.partition("[")[0] not in of_law}
-    options = replace(options, native=True, fmi=2)
+    fmi = fmi_version(options)
+    options = replace(options, native=True, fmi=fmi, arrays=fmi == 2)
     parts = {
         "plant": replace(
             options,
@@ -52,15 +69,15 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
     for name, part in parts.items():
         _, files, finish = compose(part)
         fmus[f"resources/{name}.fmu"] = {**files, **finish()}
-        root = ET.fromstring(files["modelDescription.xml"])
-        tables[name] = {v.get("name", ""): v for v in root.iterfind("ModelVariables/ScalarVariable")}
+        rows = ET.fromstring(files["modelDescription.xml"]).iterfind("ModelVariables/*")
+        tables[name] = {v.get("name", ""): Row.of(v) for v in rows}
     return {
         "SystemStructure.ssd": _structure(options.name, tables),
         **{f"resources/{name}.ssv": _values(name, table) for name, table in tables.items()},
     }, fmus
 
 
-def _structure(title: str, tables: Mapping[str, Mapping[str, ET.Element]]) -> bytes:
+def _structure(title: str, tables: Mapping[str, Mapping[str, Row]]) -> bytes:
     """Return the text of SystemStructure.ssd.
 
     Only the connectors that a connection or an observer needs are listed, because some importers connect unconnected
@@ -82,10 +99,9 @@ def _structure(title: str, tables: Mapping[str, Mapping[str, ET.Element]]) -> by
         connectors = ET.SubElement(component, f"{SSD}Connectors")
         driven = {name for _, _, end, name in wires if end == part}
         for name, variable in table.items():
-            if name in driven or variable.get("causality") == "output":
-                kind = variable.get("causality", "")
-                connector = ET.SubElement(connectors, f"{SSD}Connector", name=name, kind=kind)
-                ET.SubElement(connector, f"{SSC}{variable[0].tag}")
+            if name in driven or variable.causality == "output":
+                connector = ET.SubElement(connectors, f"{SSD}Connector", name=name, kind=variable.causality)
+                ET.SubElement(connector, f"{SSC}{variable.type}")
         bindings = ET.SubElement(component, f"{SSD}ParameterBindings")
         ET.SubElement(bindings, f"{SSD}ParameterBinding", source=f"resources/{part}.ssv")
     connections = ET.SubElement(system, f"{SSD}Connections")
@@ -96,14 +112,14 @@ def _structure(title: str, tables: Mapping[str, Mapping[str, ET.Element]]) -> by
     return _text(root)
 
 
-def _values(name: str, table: Mapping[str, ET.Element]) -> bytes:
+def _values(name: str, table: Mapping[str, Row]) -> bytes:
     """Return the parameter set of a component: the start values of its parameters and inputs."""
     root = ET.Element(f"{SSV}ParameterSet", version="1.0", name=name)
     parameters = ET.SubElement(root, f"{SSV}Parameters")
     for own, variable in table.items():
-        if variable.get("causality") in ("parameter", "input") and (start := variable[0].get("start")) is not None:
+        if variable.causality in ("parameter", "input") and variable.start is not None:
             parameter = ET.SubElement(parameters, f"{SSV}Parameter", name=own)
-            ET.SubElement(parameter, f"{SSV}{variable[0].tag}", value=start)
+            ET.SubElement(parameter, f"{SSV}{variable.type}", value=variable.start)
     return _text(root)
 
 
