@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import re
+import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -107,6 +109,17 @@ def test_its_description_is_that_of_a_law(tmp_path: Path, fmi: int) -> None:
     assert {name for name, kind in groups.items() if kind == "output"} == {"tau_cmd", "q_meas", "v_meas"}
     assert not groups.keys() & {"x", "q_start", "max_step", "friction", "tau_ext", "der(q"}
     assert not description.derivatives
+
+
+@pytest.mark.parametrize(
+    ("key", "inside"), [("plant", [False, True]), ("task law", [True, False]), ("task both", [True] * 2)]
+)
+def test_its_documentation_draws_the_loop(fmus: dict[str, Path], key: str, inside: list[bool]) -> None:
+    """Controller and plant, of which the one that is not in the FMU is dashed."""
+    with zipfile.ZipFile(fmus[key]) as archive:
+        drawn = re.findall("<svg.*</svg>", archive.read("documentation/index.html").decode(), re.DOTALL)
+    blocks = ET.fromstring(drawn[0]).iter("rect")
+    assert [block.get("class") for block in blocks] == ["inside" if here else "outside" for here in inside]
 
 
 def test_its_effort_is_that_of_the_whole_at_once(fmus: dict[str, Path]) -> None:

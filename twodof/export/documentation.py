@@ -32,6 +32,8 @@ def documentation(
         robot=html.escape(robot.name),
         frame=frame,
         axes=", ".join(robot.axes),
+        controller="outside" if options.control == "effort" else "inside",
+        plant="outside" if options.part == "controller" else "inside",
         control=CONTROLS[options.control].title.format(frame=frame),
         law=html.escape(str(LAWS[options.control].__doc__).strip()),
         root=html.escape(robot.root),
