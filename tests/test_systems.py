@@ -8,9 +8,12 @@ import time
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from systems import NAMESPACES, WIRES, component, connection, connectors, loop, pd_fmu, ssd, zipped
 
 import twodof
@@ -335,6 +338,34 @@ def test_the_bag_of_a_system_names_its_fmus_and_info_draws_it(
     capsys.readouterr()
     assert main(["info", str(system)]) == 0
     assert "pd.tau -> plant.tau_cmd, 2 values" in capsys.readouterr().out
+
+
+def test_signals_of_all_fmus_are_in_a_topic(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """Named numbers, which PlotJuggler plots by name; in a robot's own FMU too."""
+    system, bag = loop(tmp_path / "loop.ssp", plant, pd), tmp_path / "bag"
+    given = [text for name, value in {**GAINS, "pd.q_des": "0.3,0.2"}.items() for text in ("--set", f"{name}={value}")]
+    assert main(["run", str(system), "-o", str(bag), "--stop-time", "0.5", "--signals", "--scene", *given]) == 0
+    (names,) = [message.names for topic, message in decoded(bag) if topic == "/signals/names"]
+    rows = np.array([message.values for topic, message in decoded(bag) if topic == "/signals/values"])
+    assert names == json.loads((bag / "run.json").read_text())["signals"]
+    signals, recorded = dict(zip(names, rows.T, strict=True)), twodof.read_bag(bag)
+    assert len(rows) == recorded.count == N + 1
+    for i in range(2):
+        np.testing.assert_array_equal(signals[f"q[{i + 1}]"], recorded.q[:, i])
+        expected = 0.1 * (TARGET[i] - recorded.q[:, i]) - 0.01 * recorded.v[:, i]
+        np.testing.assert_allclose(signals[f"pd.tau[{i + 1}]"], expected, rtol=0, atol=1e-15)
+    alone = tmp_path / "plant.fmu"
+    alone.write_bytes(plant)
+    run = twodof.experiment(alone, signals=True, stop_time=0.02)
+    for sample in twodof.samples(run):
+        assert dict(zip(run.signals, sample.signals))["x[1]"] == sample.x[0]
+
+
+def decoded(bag: Path) -> list[tuple[str, Any]]:
+    """Return topics and messages of an MCAP bag by the MCAP project's reader."""
+    with next(bag.glob("*.mcap")).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
 
 
 def test_of_several_robots_one_is_chosen(plant: bytes, pd: bytes, tmp_path: Path) -> None:

@@ -50,8 +50,9 @@ SHAPE = {
 class Provenance(TypedDict, total=False):
     """Content of run.json; empty for a third-party bag.
 
-    ``system`` has the FMUs of a system and their connections. ``input_changes`` has pairs of a time, s, and values by
-    name; ``commanders`` has pairs of a time and facts of a third party. ``verdict`` is missing if the writer died.
+    ``signals`` has the names of the recorded signals, and ``system`` the FMUs of a system and their connections.
+    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` has pairs of a time and facts of a
+    third party. ``verdict`` is missing if the writer died.
     """
 
     format: int
@@ -67,6 +68,7 @@ class Provenance(TypedDict, total=False):
     versions: dict[str, str]
     command_line: str
     urdf: str | None
+    signals: list[str]
     system: dict[str, Any]
     input_changes: list[list[Any]]
     inputs_known_until: float
@@ -154,6 +156,7 @@ def provenance_of(run: Experiment, command_line: str) -> Provenance:
         "versions": versions(*PACKAGES),
         "command_line": command_line,
         "urdf": fmu.urdf,
+        **({"signals": [*run.signals]} if run.signals else {}),
         **(_system(fmu) if isinstance(fmu, System) else {}),
     }
 

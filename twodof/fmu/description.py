@@ -142,6 +142,11 @@ class Fmu:
         settable = (v for v in self.variables.values() if v.causality in ("input", "parameter"))
         return {v.name: v.start_value for v in settable if v.start_value is not None}
 
+    @property
+    def real_outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that are real numbers."""
+        return tuple(v.name for v in self.variables.values() if (v.causality, v.type) == ("output", "Real"))
+
     def remarks(self, asked: Iterable[str] = ()) -> list[str]:
         """Return lines about a run with some settings; a system has them."""
         return []

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from ctypes import c_double, sizeof
 from functools import partial
+from itertools import groupby
 
 import fmpy
 
@@ -94,10 +95,19 @@ class SystemInstance:
         self._propagate()
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
-        """Return a function that reads Real variables of the robot, always into the same buffer."""
-        nodes = [self._system.places[name] for name in names]
-        (element,) = {node.element for node in nodes}
-        return self._instances[element].reader([node.connector for node in nodes])
+        """Return a function that reads Real variables, always into the same buffer."""
+        nodes, first = [self._system.places[name] for name in names], 0
+        values, reads = (c_double * len(nodes))(), []
+        for element, group in groupby(nodes, key=lambda node: node.element):
+            own = [node.connector for node in group]
+            reads.append((element, self._instances[element].reader(own, _part(values, first, len(own)))))
+            first += len(own)
+
+        def read_all() -> Values:
+            self._each(reads)
+            return values
+
+        return read_all if len(reads) > 1 else reads[0][1]
 
     def _propagate(self) -> None:
         """Pass the outputs of this instant to the inputs."""
@@ -125,23 +135,20 @@ class SystemInstance:
             if sources := [node for node in reals if node not in incoming]:
                 first = len(self._columns)
                 self._columns |= {node: first + i for i, node in enumerate(sources)}
-                yield element, instance.reader([node.connector for node in sources], self._part(first, len(sources)))
+                part = _part(self._signals, first, len(sources))
+                yield element, instance.reader([node.connector for node in sources], part)
             if sinks:
                 yield element, self._writer(instance, sorted(sinks, key=lambda link: self._columns[link.source]))
             for node in (node for node in own if node not in reals):
                 move = self._set_one if node in incoming else self._read_one
                 yield element, partial(move, instance, node, incoming[node].source if node in incoming else node)
 
-    def _part(self, first: int, size: int) -> Values:
-        """Return a part of the signals, with the same memory."""
-        return (c_double * size).from_buffer(self._signals, first * sizeof(c_double))
-
     def _writer(self, instance: Instance, sinks: Sequence[Link]) -> Callable[[], None]:
         """Return a function that sets inputs from signals; equal signals in order are not copied."""
         names, columns = [link.target.connector for link in sinks], [self._columns[link.source] for link in sinks]
         equal = all(link.map == IDENTITY for link in sinks)
         if equal and columns == [*range(columns[0], columns[0] + len(columns))]:
-            return instance.writer(names, self._part(columns[0], len(columns)))
+            return instance.writer(names, _part(self._signals, columns[0], len(columns)))
         values, signals = (c_double * len(sinks))(), self._signals
         write, rows = instance.writer(names, values), [(link.map, column) for link, column in zip(sinks, columns)]
 
@@ -156,6 +163,11 @@ class SystemInstance:
 
     def _set_one(self, instance: Instance, node: Node, source: Node) -> None:
         instance.set({node.connector: self._discrete[source]})
+
+
+def _part(values: Values, first: int, size: int) -> Values:
+    """Return a part of a buffer, with the same memory."""
+    return (c_double * size).from_buffer(values, first * sizeof(c_double))
 
 
 @contextmanager

@@ -31,9 +31,13 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 TRANSFORMS = "/tf"
 TARGET = "/target"
 END_EFFECTOR = "/end_effector"
+SIGNALS = "/signals/values"
+SIGNAL_NAMES = "/signals/names"
 CLOCK = "/clock"
 POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
+NAMES = "pal_statistics_msgs/msg/StatisticsNames"
+VALUES = "pal_statistics_msgs/msg/StatisticsValues"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 FOREVER = QosTime(9223372036, 854775807)
 
@@ -56,6 +60,8 @@ DEFINITIONS = {
     "trajectory_msgs/msg/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\n"
     "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start",
     JOINT_TRAJECTORY: "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points",
+    NAMES: "std_msgs/Header header\nstring[] names\nuint32 names_version",
+    VALUES: "std_msgs/Header header\nfloat64[] values\nuint32 names_version",
     "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
     "geometry_msgs/msg/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
     "geometry_msgs/Transform transform",
@@ -151,7 +157,7 @@ class Messages:
         if measured and not run.fmu.vector("q_meas"):
             raise BagError(f"'{run.fmu.path}' has no outputs q_meas[i] and v_meas[i], which `measured` records")
         self._scene = _load_scene(run, meshes_in) if scene else None
-        self._axes = ["xyz".index(axis) for axis in run.fmu.axes]
+        self._axes, self._signals = ["xyz".index(axis) for axis in run.fmu.axes], run.signals
         n, m, poses = len(run.fmu.joints), 0, False
         efforts = n if effort else 0
         layouts: dict[str, Layout] = {CLOCK: Layout(Stamp())} if clock else {}
@@ -170,6 +176,9 @@ class Messages:
                 self.topics |= dict.fromkeys((TARGET, END_EFFECTOR), Topic(POSE, STREAM))
             if not m:
                 del self.topics[TARGET], layouts[TARGET]
+        if self._signals:
+            layouts[SIGNALS] = Layout(Stamp(), "", len(self._signals), Numbers(len(self._signals)), 0)
+            self.topics |= {SIGNAL_NAMES: Topic(NAMES, LATCHED), SIGNALS: Topic(VALUES, STREAM)}
         if clock:
             self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
         self._layouts, self._efforts, turns = layouts, efforts, 4 * poses
@@ -177,6 +186,7 @@ class Messages:
         sizes = {
             "q": n,
             "v": n,
+            "signals": len(self._signals),
             "q_meas": seen,
             "v_meas": seen,
             "tau": efforts,
@@ -200,7 +210,7 @@ class Messages:
         Raises:
             struct.error: the sample does not belong to this run.
         """
-        given: tuple[float, ...] = (*sample.q_meas, *sample.v_meas) if self._measured else ()
+        given = (*sample.signals, *sample.q_meas, *sample.v_meas) if self._measured else sample.signals
         given = (*given, *sample.tau) if self._efforts else given
         if self._scene is not None:
             if sample.inputs is not self._inputs:
@@ -218,6 +228,7 @@ class Messages:
         table = np.frombuffer(numbers, self._numbers)
         seen = ("q_meas", "v_meas", "tau") if self._measured else ("q", "v", "tau")
         parts = {CLOCK: [], JOINT_STATES: [table[key] for key in seen]}
+        parts[SIGNALS] = [table["signals"]]
         parts[TRUE_STATES] = [table["q"], table["v"], table["tau"][:, :0]]
         if self._scene is not None:
             end_effector = self._scene.end_effector(table["q"])
@@ -233,14 +244,16 @@ class Messages:
         return stamps, {t: layout.pack(stamps, *parts[t]) for t, layout in self._layouts.items()}
 
     def latched(self, stamp: int | np.int64) -> dict[str, Rows]:
-        """Return the messages that hold for the whole run: robot description and fixed transforms.
+        """Return the messages that hold for the whole run: names of signals, robot description and fixed transforms.
 
         ``stamp`` is their time stamp, ns since the epoch.
         """
+        names = Layout(Stamp(), "", len(self._signals), *self._signals, 0).pack(np.array([stamp]))
+        named = {SIGNAL_NAMES: names} if self._signals else {}
         if self._scene is None:
-            return {}
+            return named
         fixed = self._scene.transforms(self._scene.fixed, np.empty((1, 0)))
-        return {
+        return named | {
             "/robot_description": Layout(self._scene.description).pack([0]),
             "/tf_static": _tf_layout(self._scene.fixed).pack(np.array([stamp]), *fixed),
         }

@@ -38,6 +38,7 @@ class Experiment:
         given: start values that the settings give.
         changes: times, s, and the inputs that change at them, after the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
+        signals: names of the Real outputs that samples have as ``signals``.
         commanders: times in s, and facts of each node whose commands are followed from that time on.
     """
 
@@ -49,6 +50,7 @@ class Experiment:
     given: Mapping[str, Value]
     changes: Changes
     stamp_start: float | None
+    signals: tuple[str, ...] = ()
     commanders: list[tuple[float, dict[str, str]]] = field(default_factory=list)
 
     def __repr__(self) -> str:
@@ -85,6 +87,7 @@ class ExperimentOptions(TypedDict, total=False):
     input_file: str | Path | None
     changes: Sequence[tuple[float, Mapping[str, Setting]]] | None
     stamp_start: float | None
+    signals: bool
 
 
 def experiment(
@@ -97,6 +100,7 @@ def experiment(
     input_file: str | Path | None = None,
     changes: Sequence[tuple[float, Mapping[str, Setting]]] | None = None,
     stamp_start: float | None = None,
+    signals: bool = False,
 ) -> Experiment:
     """Check the settings of a run.
 
@@ -107,6 +111,7 @@ def experiment(
         input_file: CSV of inputs over time (``read_changes``).
         changes: instead of a file, times, s, and the inputs that change; earlier changes apply at the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
+        signals: whether samples and bags have all Real outputs, of a system those of all FMUs.
 
     Raises:
         InputError, FmuError: an argument or the FMU is invalid; the message names it.
@@ -138,6 +143,7 @@ def experiment(
         given=given,
         changes=[*due],
         stamp_start=stamp_start,
+        signals=fmu.real_outputs if signals else (),
     )
     for line in fmu.remarks(settings or ()):
         LOG.warning(f"'{fmu.path}': {line}")

@@ -157,8 +157,9 @@ def _sampler(
     groups = [run.fmu.vector(group) for group in (*OUTPUTS, "q_meas", "v_meas")]
     ends = list(accumulate(map(len, groups)))
     read, unpack = instance.reader([*chain(*groups)]), Struct(f"{ends[-1]}d").unpack
-    of_q, of_v, of_x, of_tau, *rest = (slice(a, b) for a, b in zip([0, *ends], ends))
+    of_q, of_v, of_x, of_tau, *of_rest = (slice(a, b) for a, b in zip([0, *ends], ends))
     judged = memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # a view of the buffer that all reads use
+    signals = instance.reader(run.signals) if run.signals else tuple
     start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
@@ -169,7 +170,8 @@ def _sampler(
         watch(judged)
         stamp = first_stamp + round(k * step * NANOSECONDS)
         parts = values[of_q], values[of_v], values[of_x], values[of_tau]
-        return Sample(k, t, *parts, inputs, since, stamp, *(values[of] for of in rest))
+        quat, q_meas, v_meas = (values[of] for of in of_rest)
+        return Sample(k, t, *parts, inputs, since, stamp, quat, q_meas, v_meas, tuple(signals()))
 
     return take
 

@@ -30,6 +30,7 @@ class Sample(NamedTuple):
         stamp: time stamp of the sample's messages, ns since the epoch.
         quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has none.
         q_meas, v_meas: measured values at the controller's latest sample, like q and v; empty if the FMU has none.
+        signals: values of the experiment's ``signals``.
     """
 
     k: int
@@ -44,6 +45,7 @@ class Sample(NamedTuple):
     quat: tuple[float, ...] = ()
     q_meas: tuple[float, ...] = ()
     v_meas: tuple[float, ...] = ()
+    signals: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         parts = ", ".join(f"{name}={_brief(getattr(self, name))}" for name in ("q", "v", "x", "tau"))
