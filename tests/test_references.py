@@ -195,3 +195,15 @@ def test_damaged_references_fail_their_row(
     files[FOLDER + name] = files[FOLDER + name].replace(old, new)
     found = rows(packed(files, tmp_path / "damaged.fmu"))
     assert any(row.outcome == "failed" and text in row.text for row in found.values()), found
+
+
+def test_an_experiment_may_have_any_name_and_needs_results(built: Path, tmp_path: Path) -> None:
+    """A name that reads like the row of a tool; results at the start alone are no results."""
+    files = members(built)
+    experiments, results = f"{FOLDER}references.exp", f"{FOLDER}move-ref.csv"
+    files[experiments] = files[experiments].replace(b'name="push"', b'name="push with fmpy"')
+    head = files[results].splitlines()[0]
+    files[results] = head + b"\n0" + b",0" * head.count(b",")
+    found = rows(packed(files, tmp_path / "named.fmu"))
+    assert found["reference push with fmpy"].outcome == "passed"
+    assert found["reference move"].text == "its results have no values after its start"

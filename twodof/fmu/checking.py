@@ -25,7 +25,6 @@ from .system import load_system
 from .trial import Trial, UnpassedError
 from .trials import TRIALS, reference_run
 
-REFERENCE, WITH = "reference ", " with "
 MOST_PROBLEMS = 20  # of a description, in its row
 
 
@@ -125,25 +124,38 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
         yield from (Row(name, "does not apply", reason) for name in TRIALS)
         return
     runs = _runs(known, tools)
-    yield from _tried(known, [*TRIALS, *runs])
+    yield from _tried(known, [*(_Task(name) for name in TRIALS), *runs])
     if not runs:
         yield Row("references", "does not apply", "it carries no experiments with results in the form of FMI-LS-REF")
 
 
-def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
-    """Return the names of the rows of references, one for each experiment and tool."""
+class _Task(NamedTuple):
+    """A trial, or the run of a reference in a tool, "" for this one."""
+
+    trial: str
+    reference: str = ""
+    tool: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of its row."""
+        return " ".join(filter(None, (self.trial, self.reference, self.tool and f"with {self.tool}")))
+
+
+def _runs(fmu: Fmu, tools: Sequence[str]) -> list[_Task]:
+    """Return the runs of references, one for each experiment and tool."""
     try:
         names = [reference.name for reference in references_of(fmu)]
     except FmuError:  # the row of the references has the error
         names = [""]
     if tools and not names:
         raise InputError(f"'{fmu.path}' carries no references to run; build one with `reference=True`")
-    return [f"{REFERENCE}{name}{tool and WITH + tool}" for name in names for tool in ("", *tools)]
+    return [_Task("reference", name, tool) for name in names for tool in ("", *tools)]
 
 
-def _tried(fmu: Fmu, names: Sequence[str]) -> Iterator[Row]:
+def _tried(fmu: Fmu, tasks: Sequence[_Task]) -> Iterator[Row]:
     """Yield the row of each trial; after a crash, a new process does the remaining trials."""
-    waiting = [*names]
+    waiting = [*tasks]
     while waiting:
         doing = "its start"
         with (
@@ -154,15 +166,15 @@ def _tried(fmu: Fmu, names: Sequence[str]) -> Iterator[Row]:
                 while waiting:
                     kind, *words = json.loads(child.receive(MAX_ROW, MAX_CALL_WAIT))
                     if kind == "row":
-                        yield Row(waiting.pop(0), *words)
+                        yield Row(waiting.pop(0).name, *words)
                     else:
                         (doing,) = words
             except (EOFError, ValueError, TypeError) as end:  # an FMU can write what it likes
                 limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
-                yield Row(waiting.pop(0), "failed", f"it ended its process at: {doing}{limit}: {end}")
+                yield Row(waiting.pop(0).name, "failed", f"it ended its process at: {doing}{limit}: {end}")
 
 
-def _serve(pipe: Connection, path: Path, inside: str, names: Sequence[str], folder: Path) -> None:
+def _serve(pipe: Connection, path: Path, inside: str, tasks: Sequence[_Task], folder: Path) -> None:
     """Do the trials in the child, in a folder; send the name of each call before it, and each result."""
     limit(MAX_CHECK_MEMORY)
     os.chdir(folder)
@@ -174,18 +186,17 @@ def _serve(pipe: Connection, path: Path, inside: str, names: Sequence[str], fold
 
     references: dict[str, Reference] = {}
 
-    def result(name: str) -> str:
-        if name in TRIALS:
-            return TRIALS[name](trial)
-        experiment, _, tool = name.removeprefix(REFERENCE).partition(WITH)
+    def result(task: _Task) -> str:
+        if task.trial in TRIALS:
+            return TRIALS[task.trial](trial)
         if not references:
             references.update({reference.name: reference for reference in references_of(trial.fmu)})
-        return reference_run(trial, references[experiment], tool)
+        return reference_run(trial, references[task.reference], task.tool)
 
-    for name in names:
+    for task in tasks:
         outcome = "passed"
         try:
-            text = result(name)
+            text = result(task)
         except UnpassedError as unpassed:
             outcome, text = unpassed.outcome, str(unpassed)
         except Exception as error:  # any exception of FMPy is the result of this trial

@@ -84,7 +84,7 @@ class Reference(NamedTuple):
         """Compare the columns of the results, one row for each communication point; return a line.
 
         Raises:
-            SimulationError: the columns differ by more than the tolerance.
+            SimulationError: the columns differ by more than the tolerance, or there is nothing to compare.
         """
         names, numbers = self.results
         index = np.rint((numbers[:, 0] - self.start) / self.step).astype(int)
@@ -92,6 +92,8 @@ class Reference(NamedTuple):
             raise SimulationError("its results are not at communication points")
         kept = (index > 0) & (index < len(rows))
         expected, found = numbers[kept, 1:], rows[index[kept]]
+        if not expected.size:
+            raise SimulationError("its results have no values after its start")
         off = np.abs(found - expected) / np.maximum(1.0, np.abs(expected).max(axis=0, initial=0.0))
         k, i = np.unravel_index(np.nanargmax(np.where(np.isnan(off), np.inf, off)), off.shape)
         if not off[k, i] <= self.tolerance:
