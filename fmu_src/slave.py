@@ -77,7 +77,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         robot = importlib.import_module(f"{PACKAGE}.plant.robot").load_robot(urdf, config["frame"], config["axes"])
         starts = {k: tuple(v) if isinstance(v, list) else v for k, v in config["starts"].items()}
         variables = importlib.import_module(f"{PACKAGE}.plant.variables")
-        self._table = variables.variable_table(robot, starts, config["control"])
+        self._table = variables.variable_table(robot, starts, config["control"], config["outputs"])
         self._plant = self._plant_module.Plant(robot, self._table, config["control"])
         self._identity = config["identity"]
         self._phase = INSTANTIATED

@@ -211,6 +211,37 @@ void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double ar
 }
 #endif
 
+/* The outputs on request. */
+static void compute_equations(Plant *plant, const JointPosition joint[N_BODIES], const TaskFrame *task)
+{
+    (void)plant, (void)joint, (void)task;
+#if defined HAS_M || defined HAS_H
+    const double still[N_JOINTS] = {0};
+    EndBody end_body;
+    body(plant->value, 0, &end_body);
+#endif
+#ifdef HAS_M
+    for (int k = 0; k < N_JOINTS; k++) { /* a column for each acceleration of 1 */
+        const double weightless[3] = {0};
+        double unit[N_JOINTS] = {0}, column[N_JOINTS];
+        unit[k] = 1.0;
+        inverse_dynamics(joint, &end_body, &plant->value[ARMATURE], still, unit, weightless, column);
+        for (int i = 0; i < N_JOINTS; i++)
+            plant->value[M + i * N_JOINTS + k] = column[i];
+    }
+#endif
+#ifdef HAS_H
+    inverse_dynamics(joint, &end_body, &plant->value[ARMATURE], &plant->value[V], still, &plant->value[GRAVITY],
+                     &plant->value[H]);
+#endif
+#ifdef HAS_J
+    memcpy(&plant->value[J], task->J, sizeof task->J);
+#endif
+#ifdef HAS_DRIFT
+    memcpy(&plant->value[DRIFT], task->drift, sizeof task->drift);
+#endif
+}
+
 void compute_position(Plant *plant)
 {
     JointPosition joint[N_BODIES];
@@ -225,6 +256,7 @@ void compute_position(Plant *plant)
     quaternion(task.R, &plant->value[QUAT]);
     memcpy(&plant->value[OMEGA], &task.xd[N_AXES], 3 * sizeof *task.xd);
 #endif
+    compute_equations(plant, joint, &task);
 }
 
 void control_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS], int rank,

@@ -29,7 +29,8 @@ INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS],
                                    double a[N_JOINTS], double reaction[N_JOINTS], double *margin);
 #endif
 
-/* Compute the outputs x and xd, and with an orientation quat and omega, at the plant's state. */
+/* Compute the outputs x and xd, with an orientation quat and omega, and on request M, h, J and drift, at the plant's
+   state. */
 INTERNAL void compute_position(Plant *plant);
 
 #ifdef IS_COMPLEX

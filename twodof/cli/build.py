@@ -46,11 +46,19 @@ def add(build: Parser) -> None:
     option("--part", choices=("all", "controller"), default="all", help=text)
     text = "build plant and controller as two native FMUs, connected in an SSP file"
     option("--split", action="store_const", dest="part", const="split", help=text)
+    text = "further outputs: mass matrix, nonlinear effects, Jacobian, or its drift"
+    option("--with", dest="outputs", nargs="+", choices=("M", "h", "J", "drift"), default=[], help=text)
     flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
     flag("--overwrite", help="replace an existing file; the default arm's FMU does not need it")
     flag("--link-environment", help="store the path of this Python's packages in the FMU")
+    _add_native(build)
+
+
+def _add_native(build: argparse.ArgumentParser) -> None:
+    """Add the options of native FMUs."""
+    option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     flag("--native", help="build the FMU as compiled C, which needs no Python")
     build.add_repeatable(
         "--platform",
@@ -131,6 +139,7 @@ def _build(options: argparse.Namespace) -> Path:
         control="pose" if options.orientation else options.control,
         settings=parse_settings(options.settings),
         arrays=not options.scalars,
+        outputs=tuple(options.outputs),
         platforms=tuple(dict.fromkeys(platforms)),
         **given_options(options, "axes", "link_environment", "native", "fmi", "reference", "part"),
     )

@@ -151,7 +151,7 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
             if options.control == "pose":
                 starts["quat_des"] = tuple(plant.quat)
         _set(robot, starts, options.control, values, {name.partition("[")[0] for name in values})
-        table = variable_table(robot, starts, options.control)
+        table = variable_table(robot, starts, options.control, options.outputs)
         if refusal := next(filter(None, (v.refusal(v.start) for v in table if v.start is not None)), ""):
             raise ParameterError(refusal)
         Plant(robot, table, options.control).initialise()

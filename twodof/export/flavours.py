@@ -62,6 +62,7 @@ def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Starts)
         "frame": robot.frame,
         "axes": robot.axes,
         "control": options.control,
+        "outputs": options.outputs,
         "starts": starts,
         "site_packages": [*dict.fromkeys(folders)] if options.link_environment else [],
     }

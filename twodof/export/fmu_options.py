@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import BuildError, choice
-from ..plant.variables import CONTROLS
+from ..plant.variables import CONTROLS, ON_REQUEST
 
 DEFAULT_NAME = "TwoDof"
 
@@ -27,6 +27,7 @@ class FmuOptions:
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else (0, 0, −9.81).
         q_start: start positions, rad or m, in the order of the joints or by name; default: the shipped arm's
             positions, or 0 if it is within the limits, or the middle of the limits.
+        outputs: further outputs for controllers: "M" mass matrix, "h" nonlinear effects, "J" Jacobian, "drift" J̇ v.
         settings: start values of variables by name, as in ``experiment``.
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".
@@ -54,6 +55,7 @@ class FmuOptions:
     q_start: tuple[float, ...] | Mapping[str, float] | None = None
     control: str = "task"
     settings: Mapping[str, object] = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
     part: str = "all"
     name: str = ""
     link_environment: bool = False
@@ -76,6 +78,11 @@ class FmuOptions:
             raise BuildError(f"`lock` is {self.lock!r:.50}; give positions by joint, as {{'joint1': 0.0}}")
         if self.part not in ("all", "controller", "split"):
             raise BuildError(f"`part` '{self.part}' is unknown; it is 'all', 'controller' or 'split'")
+        for name in self.outputs:
+            if name not in ON_REQUEST:
+                raise BuildError(f"`outputs` '{name}' is unknown{choice(name, ON_REQUEST)}")
+        if self.part == "controller" and self.outputs:
+            raise BuildError("M, h, J and drift are outputs of the plant, which the controller alone does not have")
         if self.part == "split" and self.control == "effort":
             raise BuildError("a split robot has a control law other than 'effort', which is the plant alone")
         if self.part != "all" and self.reference:
@@ -86,7 +93,19 @@ class FmuOptions:
     @property
     def is_default_arm(self) -> bool:
         """True for the shipped arm with its default settings, in any flavour."""
-        model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "settings", "part", "name")
+        model = (
+            "urdf",
+            "frame",
+            "lock",
+            "axes",
+            "gravity",
+            "q_start",
+            "control",
+            "outputs",
+            "settings",
+            "part",
+            "name",
+        )
         return all(getattr(self, key) == getattr(FmuOptions(), key) for key in model)
 
 

@@ -197,7 +197,8 @@ def _variables(
             continue
         element = ET.SubElement(variables, FMI3_TYPES.get(first.type, first.type), attributes)
         if name != first.name:
-            ET.SubElement(element, "Dimension", start=str(len(indices)))
+            for size in (len(indices) // first.columns, first.columns) if first.columns else (len(indices),):
+                ET.SubElement(element, "Dimension", start=str(size))
 
 
 def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges: bool) -> dict[str, str]:
@@ -258,6 +259,10 @@ def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, 
         "quat": (("q",), FRAME),
         "xd": (STATES, FRAME),
         "omega": (STATES, FRAME),
+        "M": (("q",), EVERY),
+        "h": (STATES, EVERY),
+        "J": (("q",), FRAME),
+        "drift": (STATES, FRAME),
         "tau": ((*STATES, *control.inputs), EVERY),
         "q_meas": (("q",), OWN),
         "v_meas": (STATES, OWN),
@@ -267,7 +272,10 @@ def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, 
         "q": (START, OWN),
         "x": (START, FRAME),
         "quat": (START, FRAME),
-        **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, EVERY)),
+        "J": (START, FRAME),
+        "M": ((*START, "payload", "payload_com", "armature"), EVERY),
+        "h": ((*IMPACT, "gravity"), EVERY),
+        **dict.fromkeys(("v", "xd", "omega", "drift", "der_q"), (IMPACT, EVERY)),
         "tau": ((*IMPACT, *law, *control.inputs, *STATES), EVERY),
         "q_meas": ((*START, "q", "q_resolution", "q_noise", "seed"), OWN),
         "v_meas": (IMPACT, EVERY, ("v", "v_noise", "seed", "v_from_q")),

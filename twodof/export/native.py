@@ -10,7 +10,7 @@ import numpy as np
 
 from ..plant.integrator import BUDGET
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
+from ..plant.variables import CONTROLS, ON_REQUEST, RANGES, Variable, count_event_indicators
 
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_INTEGER": "seed", "FIRST_BOOLEAN": "v_from_q"}
 """First group of each part of the table: outputs, parameters, and among these integers and Booleans."""
@@ -41,7 +41,7 @@ def model_header(
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         f"#define IS_CONTROLLER {int(is_controller)} /* the control law alone: q and v are inputs */\n"
-        + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
+        + "".join(f"#define HAS_{group.upper()}\n" for group in ("rcond", *ON_REQUEST) if group in groups),
         _groups(groups, {**FIRST, "FIRST_OUTPUT": "x"} if is_controller else FIRST),
         _references(table, fmi == 3 and arrays),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),

@@ -63,7 +63,7 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
             name=f"{options.name}_plant",
             settings={"rigid_stops": law.rigid_stops, **of_plant},
         ),
-        "controller": replace(options, part="controller", name=f"{options.name}_controller"),
+        "controller": replace(options, part="controller", outputs=(), name=f"{options.name}_controller"),
     }
     fmus, tables = {}, {}
     for name, part in parts.items():

@@ -92,6 +92,7 @@ class Plant(ControlledPlant):
         self.v = list(self.v_start)
         self.sampling = Sampling.begin(len(self.q), self.time)
         self._axes = ["xyz".index(axis) for axis in robot.axes]
+        self._rows = [*self._axes, 3, 4, 5] if control == "pose" else self._axes
         self._swing = robot.swing()
         self.prepare()
 
@@ -191,6 +192,28 @@ class Plant(ControlledPlant):
     def omega(self) -> list[float]:
         """Angular velocity of the task frame about the root's axes, rad/s."""
         return [sum(map(mul, row, self.v)) for row in self._observed()[1][3:]]
+
+    @property
+    def M(self) -> list[float]:
+        """Mass matrix of the robot with payload and armature, row by row."""
+        return list(self._real.mass_matrix(np.array(self.q)).flat)
+
+    @property
+    def h(self) -> list[float]:
+        """Effort of gravity, Coriolis and centrifugal forces, n values."""
+        return list(self._real.inverse_dynamics(np.array(self.q), np.array(self.v), np.zeros(len(self.q))))
+
+    @property
+    def J(self) -> list[float]:
+        """Jacobian of the task, row by row: the task axes and, with an orientation, the rotations about x, y and z."""
+        jacobian = self._observed()[1]
+        return [element for row in self._rows for element in jacobian[row]]
+
+    @property
+    def drift(self) -> list[float]:
+        """Acceleration of the task without that of joints, J̇ v."""
+        drift = self._observed()[2]
+        return [drift[row] for row in self._rows]
 
     @property
     def tau(self) -> list[float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -58,6 +58,7 @@ class Variable:
         description: one line.
         called: name of the vector in the FMU, where it is not the group's; "" else.
         shown: whether the FMU has it; a part of the plant's engine otherwise.
+        columns: number of columns of a matrix, whose elements ``index`` counts row by row; 0 for other variables.
     """
 
     group: str
@@ -68,11 +69,14 @@ class Variable:
     description: str
     called: str = ""
     shown: bool = True
+    columns: int = 0
 
     @property
     def name(self) -> str:
-        """FMI name, e.g. "x_des[1]"."""
+        """FMI name, e.g. "x_des[1]" or "M[1,2]"."""
         group = self.called or self.derivative_of or self.group
+        if self.columns and self.index is not None:
+            return f"{group}[{self.index // self.columns + 1},{self.index % self.columns + 1}]"
         name = group if self.index is None else f"{group}[{self.index + 1}]"
         return f"der({name})" if self.derivative_of else name
 
@@ -139,6 +143,8 @@ CONTROLS = {
 "pose" is "task" with three more rows.
 """
 
+ON_REQUEST = ("M", "h", "J", "drift")
+"""Groups of outputs that an FMU has on request only."""
 DISTURBANCES = ("tau_ext", "f_ext")
 OF_THE_PLANT = {
     *DISTURBANCES,
@@ -172,6 +178,10 @@ ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ..
     ("xd", "output", "axis", "m/s", None, "velocity"),
     ("quat", "output", "quaternion", "", None, "orientation of {frame}"),
     ("omega", "output", "turn", "rad/s", None, "angular velocity of {frame}"),
+    ("M", "output", "joint pair", "", None, "mass matrix with payload and armature, kg.m2, of prismatic joints kg"),
+    ("h", "output", "joint", "N|N.m", None, "effort of gravity, Coriolis and centrifugal forces"),
+    ("J", "output", "task joint", "", None, "Jacobian of {frame}: rows as of the target, columns as of the joints"),
+    ("drift", "output", "task", "m/s2|rad/s2", None, "acceleration of {frame} without that of joints, dJ/dt v"),
     ("tau", "output", "joint", "N|N.m", None, "control effort applied"),
     ("q_meas", "output", "joint", "m|rad", None, "position that the controller saw"),
     ("v_meas", "output", "joint", "m/s|rad/s", None, "velocity that the controller saw"),
@@ -210,7 +220,9 @@ value (None if it is computed, given by the robot or the control law, or a targe
 Starts = Mapping[str, Value | tuple[float, ...]]
 
 
-def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[Variable]:
+def variable_table(
+    robot: Robot, starts: Starts, control: str = "task", outputs: Collection[str] = ()
+) -> list[Variable]:
     """Return the variables of a robot's FMU, in the order of their value references.
 
     Args:
@@ -218,6 +230,7 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
         starts: start values that differ from the defaults, by group. "q_start" (n values) is required, and so are
             "x_des" (m values) and "quat_des" (4 values) if the control law has them.
         control: the control law, a key of ``CONTROLS``.
+        outputs: groups of ``ON_REQUEST`` that the FMU has.
     """
     law = CONTROLS[control]
     of_robot = {group: getattr(robot, group) for group in ("q_min", "q_max", "friction", "damping")}
@@ -229,14 +242,19 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
     table: list[Variable] = []
     for group, causality, owner, unit, default, text in ROWS:
         own = group in (*law.inputs, *law.outputs, *law.parameters)
+        if group in ON_REQUEST and group not in outputs:
+            continue
         if not (own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES):
             continue
         start = starts.get(group, default) if causality in ("input", "parameter") else None
         text, (sliding, _, turning) = text.format(frame=robot.frame), unit.partition("|")
+        slides = [True] * len(robot.axes) + [False] * 3 if owner == "task" else robot.prismatic
+        columns = len(robot.joints) if owner in ("joint pair", "task joint") else 0
         for i, element in enumerate(owners[owner]):
-            own_unit = turning if turning and not robot.prismatic[i] else sliding
+            own_unit = turning if turning and not slides[i] else sliding
             value = start[i] if isinstance(start, tuple) else start
-            table.append(Variable(group, i, causality, own_unit, value, f"{text}, {element}"))
+            described = f"{text}, {element}" if element else text
+            table.append(Variable(group, i, causality, own_unit, value, described, columns=columns))
         if not owner:
             assert not isinstance(start, tuple)
             table.append(Variable(group, None, causality, unit, start, text))
@@ -264,6 +282,8 @@ def _owners(robot: Robot, law: Control) -> dict[str, list[str]]:
     """Return, for each kind of owner, a phrase for the description of each element."""
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
+    turn = [f"about axis {letter} of {robot.root}" for letter in "xyz"]
+    task = [*axis, *turn] if "quat_des" in law.inputs else axis
     return {
         "": [],
         "joint": joint,
@@ -271,7 +291,10 @@ def _owners(robot: Robot, law: Control) -> dict[str, list[str]]:
         "controlled": axis if "x_des" in law.inputs else joint,
         "root": [f"axis {letter} of {robot.root}" for letter in "xyz"],
         "frame": [f"axis {letter} of {robot.frame}" for letter in "xyz"],
-        "turn": [f"about axis {letter} of {robot.root}" for letter in "xyz"],
+        "turn": turn,
+        "task": task,
+        "task joint": [""] * (len(task) * len(joint)),
+        "joint pair": [""] * len(joint) ** 2,
         "quaternion": list("xyzw"),
     }
 
