@@ -345,8 +345,11 @@ def test_signals_of_all_fmus_are_in_a_topic(plant: bytes, pd: bytes, tmp_path: P
     system, bag = loop(tmp_path / "loop.ssp", plant, pd), tmp_path / "bag"
     given = [text for name, value in {**GAINS, "pd.q_des": "0.3,0.2"}.items() for text in ("--set", f"{name}={value}")]
     assert main(["run", str(system), "-o", str(bag), "--stop-time", "0.5", "--signals", "--scene", *given]) == 0
-    (names,) = [message.names for topic, message in decoded(bag) if topic == "/signals/names"]
-    rows = np.array([message.values for topic, message in decoded(bag) if topic == "/signals/values"])
+    messages = [(topic, message) for topic, message in decoded(bag) if topic.startswith("/signals")]
+    (_, named), *valued = messages  # the names come first
+    names, rows = named.names, np.array([message.values for _, message in valued])
+    assert {topic for topic, _ in valued} == {"/signals/values"}
+    assert {message.names_version for _, message in valued} == {named.names_version} != {0}
     assert names == json.loads((bag / "run.json").read_text())["signals"]
     signals, recorded = dict(zip(names, rows.T, strict=True)), twodof.read_bag(bag)
     assert len(rows) == recorded.count == N + 1

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,6 +159,7 @@ class Messages:
             raise BagError(f"'{run.fmu.path}' has no outputs q_meas[i] and v_meas[i], which `measured` records")
         self._scene = _load_scene(run, meshes_in) if scene else None
         self._axes, self._signals = ["xyz".index(axis) for axis in run.fmu.axes], run.signals
+        self._version = crc32("\n".join(run.signals).encode())  # PlotJuggler 3 knows names by their version alone
         n, m, poses = len(run.fmu.joints), 0, False
         efforts = n if effort else 0
         layouts: dict[str, Layout] = {CLOCK: Layout(Stamp())} if clock else {}
@@ -177,7 +179,7 @@ class Messages:
             if not m:
                 del self.topics[TARGET], layouts[TARGET]
         if self._signals:
-            layouts[SIGNALS] = Layout(Stamp(), "", len(self._signals), Numbers(len(self._signals)), 0)
+            layouts[SIGNALS] = Layout(Stamp(), "", len(self._signals), Numbers(len(self._signals)), self._version)
             self.topics |= {SIGNAL_NAMES: Topic(NAMES, LATCHED), SIGNALS: Topic(VALUES, STREAM)}
         if clock:
             self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
@@ -248,7 +250,7 @@ class Messages:
 
         ``stamp`` is their time stamp, ns since the epoch.
         """
-        names = Layout(Stamp(), "", len(self._signals), *self._signals, 0).pack(np.array([stamp]))
+        names = Layout(Stamp(), "", len(self._signals), *self._signals, self._version).pack(np.array([stamp]))
         named = {SIGNAL_NAMES: names} if self._signals else {}
         if self._scene is None:
             return named
