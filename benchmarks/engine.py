@@ -103,15 +103,16 @@ def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]
     return run
 
 
-def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float, float]:
-    """Measure the right-hand side and a derivative, s: the least of interleaved runs."""
+def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float, float, float]:
+    """Measure the right-hand side, a derivative, and the Jacobian by states and efforts, s: the least of runs."""
     side_cost = compiled(arm, folder, "native_step.c").side_cost
     side_cost.restype = ctypes.c_double
     names = [variable.name for variable in variable_table(arm.robot, arm.starts, arm.control)]
-    known, unknown = names.index("q[1]"), names.index("der(q[1])")
-    rounds = [[side_cost(derivative, calls, known, unknown) for derivative in (0, 1)] for _ in range(200)]
-    side, derivative = map(min, zip(*rounds))
-    return side, derivative
+    effort = names.index("tau_cmd[1]" if arm.control == "effort" else "tau_ext[1]")
+    places = names.index("q[1]") + 1, names.index("der(q[1])") + 1, effort + 1, len(arm.robot.joints)
+    rounds = [[side_cost(kind, calls // (1, 1, 10)[kind], *places) for kind in range(3)] for _ in range(200)]
+    side, derivative, jacobian = map(min, zip(*rounds))
+    return side, derivative, jacobian
 
 
 def measured(joints: Sequence[int]) -> Iterator[tuple[int, list[Costs]]]:

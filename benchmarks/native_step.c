@@ -33,11 +33,13 @@ FMI2_Export double step_cost(double h, int steps)
     return status == fmi2OK ? cost : NAN;
 }
 
-/* Processor time of the right-hand side, or of its derivative along a direction of all states, s,
-   at states that differ; NaN where a call fails. References are those of q[1] and der(q[1]). */
-FMI2_Export double side_cost(int derivative, int calls, int known, int unknown)
+/* Processor time of the right-hand side (0), of its derivative along a direction of all states (1), or of its
+   Jacobian by states and n inputs, a direction at a time (2), s, at states that differ; NaN where a call fails.
+   References are those of q[1], of der(q[1]) and of the first of the inputs. */
+FMI2_Export double side_cost(int kind, int calls, int known, int unknown, int input, int n)
 {
     enum { STATES = 2 * N_JOINTS };
+    static const fmi2Real one = 1.0;
     fmi2Component arm = begun(fmi2ModelExchange);
     fmi2EventInfo info;
     fmi2Real state[STATES], rate[STATES], seed[STATES];
@@ -60,8 +62,12 @@ FMI2_Export double side_cost(int derivative, int calls, int known, int unknown)
     for (int k = 0; k < calls; k++) {
         state[0] += 1e-9;
         status |= set(arm, state, STATES);
-        status |= derivative ? slope(arm, unknowns, STATES, knowns, STATES, seed, rate)
-                             : rates(arm, rate, STATES);
+        if (kind < 2)
+            status |= kind ? slope(arm, unknowns, STATES, knowns, STATES, seed, rate) : rates(arm, rate, STATES);
+        for (int c = 0; c < (kind < 2 ? 0 : STATES + n); c++) {
+            const fmi2ValueReference column = c < STATES ? knowns[c] : (fmi2ValueReference)(input + c - STATES);
+            status |= slope(arm, unknowns, STATES, &column, 1, &one, rate);
+        }
     }
     const double cost = since(begin, calls);
     fmi2FreeInstance(arm);

@@ -32,7 +32,17 @@ class Derivatives(Engine):
             change[k] = 1.0
             self.call("differentiate", values, held, slip, change, derivative)
             columns.append(derivative[self.computed])
-        return np.array(columns).T
+        jacobian = np.array(columns).T
+        if held.any():
+            jacobian[-self.n :] = self.slopes(values, held, slip)
+        return jacobian
+
+    def slopes(self, values, held=None, slip=None):
+        """∂ accelerations/∂ known, by the Jacobian."""
+        held, slip = (np.zeros(self.n, dtype=np.int32) if x is None else x for x in (held, slip))
+        slopes = np.zeros((self.n, len(self.known)))
+        self.call("slopes", values.copy(), held, slip, slopes)
+        return slopes
 
     def differences(self, values, held=None, slip=None):
         """The same by central differences, extrapolated."""

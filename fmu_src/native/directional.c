@@ -105,6 +105,11 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], const int slip[N_JO
         }
         compute_rates(plant, &stops);
     }
+    if (wanted & WANTS_LAW) {
+        JointPosition joint[N_BODIES];
+        place_joints(&plant->value[Q], joint);
+        command(plant->value, joint, &plant->value[Q], &plant->value[V], rank, &plant->value[DER_V], NULL);
+    }
 }
 
 #if COMPLEX

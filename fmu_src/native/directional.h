@@ -5,8 +5,8 @@
 
 #include "internal.h"
 
-/* Requested computed variables. */
-enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4, WANTS_SAMPLE = 8 };
+/* Requested computed variables. The law's result takes the place of the accelerations. */
+enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4, WANTS_SAMPLE = 8, WANTS_STATE = 16, WANTS_LAW = 32 };
 
 /* Changes of all variables, by index, for the changes of inputs and states in change. The variables have the values in
    value; held, slip and the rank of J⁺ are the regime (see Stops), which stays. */

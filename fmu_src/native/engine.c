@@ -15,3 +15,6 @@
 #endif
 #include "plant.c"
 #include "stops.c"
+#ifndef IS_COMPLEX
+#include "jacobian.c"
+#endif

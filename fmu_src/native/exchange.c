@@ -109,6 +109,8 @@ Status STANDARD(SetTime)(void *component, double time)
         return refuse(instance, SET_TIME, "the time is not finite");
     instance->state.time = time;
     instance->state.has_tau = 0;
+    if (instance->state.plant.value[CONTROL_PERIOD] != 0.0) /* the held effort may be another one */
+        instance->state.has_rates = 0;
     return OK;
 }
 
@@ -123,6 +125,8 @@ Status STANDARD(SetContinuousStates)(void *component, const double x[], size_t c
             return report(instance, ERROR, "%s: %s is not finite",
                           call_name(SET_CONTINUOUS_STATES), VARIABLE_NAME[Q + i]);
     update_stops(state); /* joints at rest stay at rest until an event */
+    if (memcmp(&state->plant.value[Q], x, N_CONTINUOUS * sizeof *x) == 0)
+        return OK;
     memcpy(&state->plant.value[Q], x, N_CONTINUOUS * sizeof *x);
     state->has_x = state->has_tau = state->has_rates = 0;
     return OK;

@@ -16,6 +16,7 @@
 #include "simulation.c"
 #include "exchange.c"
 #include "variables.c"
+#include "derivatives.c"
 #include "saved_state.c"
 #if FMI == 3
 #include "fmi3.c"

@@ -180,9 +180,9 @@ static int update_held(Instance *instance)
 static void update_rates(State *state)
 {
     update_stops(state);
-    if (!state->has_rates)
+    if (!(state->has_rates & RATES))
         compute_rates(&state->plant, &state->stops);
-    state->has_rates = 1;
+    state->has_rates |= RATES;
 }
 
 /* Return a new instance, a copy of the draft; NULL if it has no name or a wrong token. */
@@ -198,14 +198,18 @@ static Instance *instantiate(Instance draft, const char *token, int logging_on)
         report(&draft, ERROR, "%s: the " TOKEN " is not that of this FMU, " MODEL_GUID, function);
         return NULL;
     }
-    Instance *instance = calloc(1, sizeof *instance + strlen(name) + 1);
+    const size_t matrix = N_STATES * sizeof *draft.slope;
+    Instance *instance = calloc(1, sizeof *instance + matrix + strlen(name) + 1);
     if (!instance) {
         report(&draft, ERROR, "%s: no memory", function);
         return NULL;
     }
     *instance = draft;
     instance->silent = logging_on ? 0 : EVERY_CATEGORY - CATEGORIES_OFF;
-    instance->name = strcpy((char *)(instance + 1), name);
+    instance->slope = (double(*)[X])(instance + 1);
+    for (int i = 0; i < N_JOINTS; i++)
+        instance->slope[i][V + i] = 1.0;
+    instance->name = strcpy((char *)(instance + 1) + matrix, name);
     reset_state(&instance->state);
     return instance;
 }

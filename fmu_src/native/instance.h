@@ -71,6 +71,10 @@ typedef enum {
 /* In FMI 3.0 co-simulation may go on after a step that was discarded. */
 enum { AFTER_DISCARD = FMI == 3 ? STEP : STEP_FAILED };
 
+/* Results for the present states, inputs and parameters: the states' derivatives, those along one direction, and the
+   Jacobian. */
+typedef enum { RATES = 1, DIRECTION = 2, SLOPES = 4 } Known;
+
 /* All that getFMUstate saves. Plain data without pointers. */
 typedef struct {
     char guid[sizeof MODEL_GUID + 8 - sizeof MODEL_GUID % 8]; /* GUID of the state's model */
@@ -85,7 +89,7 @@ typedef struct {
     int has_x;        /* the output x is computed */
     int has_tau;      /* tau is computed; for a sampled controller also q_meas and v_meas */
     int has_stops;    /* the joints at rest are known */
-    int has_rates;    /* the derivatives are computed */
+    int has_rates;    /* bits of Known */
 } State;
 
 typedef struct {
@@ -94,6 +98,8 @@ typedef struct {
     void (*log)(void); /* the importer's callback; fmi2.c and fmi3.c know its type */
     void *environment; /* argument of the callback */
     const char *name;
+    double (*slope)[X]; /* the Jacobian: derivatives of the states' rates with respect to inputs and states */
+    int asks_several;   /* whether the last point had several directions */
     int silent; /* bit mask of the log categories that are off; 0 before instantiation */
 } Instance;
 

@@ -73,6 +73,25 @@ INTERNAL void hybrid_dynamics(const JointPosition joint[N_BODIES], const EndBody
                               double reaction[N_JOINTS]);
 #endif
 
+/* Derivatives of kinematics and dynamics by spatial vectors in the root's axes about the task frame's origin (angular,
+   linear; of forces moment, force). At a body's joint: its unit velocity s, ψ = v × s, χ = a × s + v × ψ, where v and a
+   are the motion of the body before it. */
+typedef struct {
+    double s[6], psi[6], chi[6];
+} JointMotion;
+
+/* Of all bodies that a joint moves: the angular part of Bᵀ s, whose linear part is 0, I s, and with the motion x of a
+   joint before it, derivatives of their effort on that joint: by q, by_q·x, and by v, by_v·x. */
+typedef struct {
+    double coriolis[3], inertial[6], by_q[6], by_v[6];
+} JointForce;
+
+#ifndef IS_COMPLEX
+INTERNAL void joint_forces(const JointPosition joint[N_BODIES], const EndBody *end_body,
+                           const double armature[N_JOINTS], const double v[N_JOINTS], const double a[N_JOINTS],
+                           const double gravity[3], JointMotion motion[N_BODIES], JointForce force[N_BODIES]);
+#endif
+
 /* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */
 INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const EndBody *end_body,
                                      const double armature[N_JOINTS], const double tau[N_JOINTS],

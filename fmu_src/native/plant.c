@@ -182,23 +182,7 @@ void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const do
         reaction[i] = rests[i] ? effort[i] - excess[i] : 0.0;
     }
 }
-#endif
 
-#ifdef IS_COMPLEX
-void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
-                  const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS])
-{
-    JointPosition joint[N_BODIES];
-    EndBody end_body;
-    place_joints(q, joint);
-    body(plant->value, 0, &end_body);
-    for (int k = 0; k < count; k++) {
-        double unit[N_JOINTS] = {0};
-        unit[joints[k]] = 1.0;
-        acceleration_of_effort(joint, &end_body, &plant->value[ARMATURE], unit, columns[k]);
-    }
-}
-#else
 void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
                    const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],
                    double reaction[N_JOINTS])

@@ -33,11 +33,7 @@ INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS],
    state. */
 INTERNAL void compute_position(Plant *plant);
 
-#ifdef IS_COMPLEX
-/* The columns of M(q)⁻¹ for count joints. */
-INTERNAL void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
-                           const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS]);
-#else
+#ifndef IS_COMPLEX
 /* a and λ of M(q) a = τ + λ, as in hybrid_dynamics. */
 INTERNAL void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
                             const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],

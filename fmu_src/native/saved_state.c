@@ -121,6 +121,7 @@ Status STANDARD(SetFMUstate)(void *component, void *saved)
     if (!can_be_in(instance->kind, ((const State *)saved)->phase))
         return refuse(instance, SET_STATE, OTHER_KIND);
     memcpy(&instance->state, saved, sizeof(State));
+    instance->state.has_rates &= RATES; /* the Jacobian is not saved */
     return OK;
 }
 

@@ -233,38 +233,15 @@ static int reacts(const Stops *stops, int i)
     return stops->held[i] == STUCK || stops->held[i] == STOPPED;
 }
 
-#ifdef IS_COMPLEX
-/* Use the columns of M⁻¹, which have derivatives. */
-static void add_reactions(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
-                          double a[N_JOINTS], double reaction[N_JOINTS])
+#ifndef IS_COMPLEX
+static int any_reacts(const Stops *stops)
 {
-    double columns[N_JOINTS][N_JOINTS], A[N_JOINTS][N_JOINTS + 1];
-    int held[N_JOINTS], n = 0;
-    for (int i = 0; i < N_JOINTS; i++)
-        if (reacts(stops, i))
-            held[n++] = i;
-    inverse_mass(plant, q, n, held, columns);
-    for (int r = 0; r < n; r++) {
-        for (int c = 0; c < n; c++)
-            A[r][c] = columns[c][held[r]];
-        A[r][n] = -a[held[r]];
-    }
-    for (int p = 0; p < n; p++) /* a positive definite matrix needs no pivots */
-        for (int r = p + 1; r < n; r++) {
-            const double factor = A[r][p] / A[p][p];
-            for (int c = p; c <= n; c++)
-                A[r][c] -= factor * A[p][c];
-        }
-    for (int r = n - 1; r >= 0; r--) {
-        double rest = A[r][n];
-        for (int c = r + 1; c < n; c++)
-            rest -= A[r][c] * reaction[held[c]];
-        reaction[held[r]] = rest / A[r][r];
-        for (int i = 0; i < N_JOINTS; i++)
-            a[i] += columns[r][i] * reaction[held[r]];
-    }
+    int any = 0;
+    for (int i = 0; i < N_JOINTS && stops->any_held; i++)
+        any |= reacts(stops, i);
+    return any;
 }
-#else
+
 static void add_reactions(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
                           double a[N_JOINTS], double reaction[N_JOINTS])
 {
@@ -282,13 +259,14 @@ static void add_reactions(const Plant *plant, const Stops *stops, const double q
 void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], double a[N_JOINTS],
               double effort[N_JOINTS])
 {
-    int any = 0;
     if (!stops->any_held)
         return;
-    for (int i = 0; i < N_JOINTS; i++)
-        any |= reacts(stops, i);
-    if (any)
+#ifndef IS_COMPLEX
+    if (any_reacts(stops))
         add_reactions(plant, stops, q, a, effort);
+#else
+    (void)plant, (void)q; /* derivatives with reactions are those of the Jacobian */
+#endif
     for (int i = 0; i < N_JOINTS; i++)
         if (stops->held[i]) {
             effort[i] = reacts(stops, i) ? effort[i] : -a[i];

@@ -51,4 +51,10 @@ INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_
 /* Compute the derivatives of the plant's state, with joints at rest held. */
 INTERNAL void compute_rates(Plant *plant, const Stops *stops);
 
+#ifndef IS_COMPLEX
+/* The derivatives of q̈ with respect to efforts and states, and with reactions also to inputs of the law, by the
+   variable's index, at a plant with the derivatives of compute_rates. */
+INTERNAL void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_JOINTS][X]);
+#endif
+
 #endif

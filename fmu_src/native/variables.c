@@ -4,7 +4,6 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "directional.h"
 #include "instance.h"
 
 /* Types in the order of the calls that get and set them. */
@@ -82,6 +81,8 @@ static void set(Instance *instance, int variable, double value)
     State *state = &instance->state;
     if (is_state(variable) && state->phase == INSTANTIATED)
         variable += Q_START - Q;
+    if (memcmp(&state->plant.value[variable], &value, sizeof value) == 0)
+        return;
     state->plant.value[variable] = value;
     state->has_tau = state->has_rates = 0;
     if (is_state(variable))
@@ -202,117 +203,3 @@ static Status set_values(void *component, Call call, const Reference vr[], size_
             set(instance, k, number_in(type, values, n++));
     return OK;
 }
-
-/* The computed variables that the derivatives of the unknowns need; -1, with a logged reason, if there are no such
-   derivatives. */
-static int wanted(Instance *instance, Call call, const Reference unknown[], size_t n_unknown,
-                  const Reference given[], size_t n_given)
-{
-    int wants = 0;
-    for (size_t i = 0; i < n_unknown; i++) {
-        const int k = INDEX[unknown[i]];
-        if (k < FIRST_OUTPUT || k >= END_OF_RATES) {
-            report(instance, ERROR, "%s: %s is not computed, it has no derivative", call_name(call),
-                   VARIABLE_NAME[k]);
-            return -1;
-        }
-        wants |= k >= DER_Q ? WANTS_RATES : k >= Q_MEAS ? WANTS_SAMPLE : k >= TAU ? WANTS_TAU : k >= X ? WANTS_X : 0;
-    }
-    for (size_t i = 0; i < n_given; i++)
-        if (INDEX[given[i]] >= X) {
-            report(instance, ERROR, "%s: %s is neither a state nor an input", call_name(call),
-                   VARIABLE_NAME[INDEX[given[i]]]);
-            return -1;
-        }
-    if (!instance->state.initialised && initialise(instance, 0) != OK)
-        return -1;
-    if (!update_held(instance)) {
-        refuse(instance, call, NO_EFFORT);
-        return -1;
-    }
-    update_stops(&instance->state);
-    return wants;
-}
-
-/* Name of the first variable whose value is not finite, or NULL. */
-static const char *culprit(const Reference vr[], size_t count, const double value[])
-{
-    for (size_t i = 0; i < count; i++)
-        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
-            if (!isfinite(*value++))
-                return VARIABLE_NAME[k];
-    return NULL;
-}
-
-/* The change of the unknowns if the knowns (states and inputs) change by the seed. */
-static Status directional_derivative(void *component, const Reference unknown[], size_t n_unknown,
-                                     const Reference given[], size_t n_given, const double seed[],
-                                     size_t n_seed, double result[], size_t n_result)
-{
-    const Call call = GET_DIRECTIONAL_DERIVATIVE;
-    Instance *instance = enter(component, call, 1);
-    double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
-    if (!instance || !known(instance, call, REAL, unknown, n_unknown, result, n_result)
-        || !known(instance, call, REAL, given, n_given, seed, n_seed))
-        return ERROR;
-    const char *name = culprit(given, n_given, seed);
-    if (name)
-        return report(instance, ERROR, "%s: the change of %s is not finite", call_name(call), name);
-    const int wants = wanted(instance, call, unknown, n_unknown, given, n_given);
-    if (wants < 0)
-        return ERROR;
-    for (size_t i = 0; i < n_given; i++)
-        for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++)
-            change[k] += *seed++;
-    const Stops *stops = &instance->state.stops;
-    differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants, change,
-                  derivative);
-    for (size_t i = 0; i < n_unknown; i++)
-        if ((name = culprit(&unknown[i], 1, &derivative[INDEX[unknown[i]]])))
-            return report(instance, DISCARD, "%s: that of %s is not finite", call_name(call), name);
-    for (size_t i = 0; i < n_unknown; result += size_of(unknown[i++]))
-        memcpy(result, &derivative[INDEX[unknown[i]]], size_of(unknown[i]) * sizeof *result);
-    return OK;
-}
-
-#if FMI == 3
-/* The change of the unknowns, weighted by the seed, for a change of each given variable by 1. */
-Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size_t n_unknown,
-                                const Reference given[], size_t n_given, const double seed[],
-                                size_t n_seed, double result[], size_t n_result)
-{
-    const Call call = GET_ADJOINT_DERIVATIVE;
-    Instance *instance = enter(component, call, 1);
-    double weight[FIRST_PARAMETER] = {0}, sum[FIRST_PARAMETER] = {0};
-    if (!instance || !known(instance, call, REAL, unknown, n_unknown, seed, n_seed)
-        || !known(instance, call, REAL, given, n_given, result, n_result))
-        return ERROR;
-    const char *name = culprit(unknown, n_unknown, seed);
-    if (name)
-        return report(instance, ERROR, "%s: the weight of %s is not finite", call_name(call), name);
-    const int wants = wanted(instance, call, unknown, n_unknown, given, n_given);
-    if (wants < 0)
-        return ERROR;
-    for (size_t i = 0; i < n_unknown; i++)
-        for (int k = INDEX[unknown[i]]; k < INDEX[unknown[i] + 1]; k++)
-            weight[k] += *seed++;
-    for (size_t i = 0; i < n_given; i++) /* a column of the Jacobian for each value */
-        for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++) {
-            double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
-            change[k] = 1.0;
-            const Stops *stops = &instance->state.stops;
-            differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants,
-                          change, derivative);
-            sum[k] = 0.0;
-            for (int u = FIRST_OUTPUT; u < END_OF_RATES; u++)
-                if (weight[u] != 0.0)
-                    sum[k] += weight[u] * derivative[u];
-            if (!isfinite(sum[k]))
-                return report(instance, DISCARD, "%s: that by %s is not finite", call_name(call),
-                              VARIABLE_NAME[k]);
-        }
-    for (size_t i = 0; i < n_given; result += size_of(given[i++]))
-        memcpy(result, &sum[INDEX[given[i]]], size_of(given[i]) * sizeof *result);
-    return OK;
-}
-#endif

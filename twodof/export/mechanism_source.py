@@ -7,6 +7,7 @@ import numpy as np
 from ..plant.robot import Robot
 from ..plant.variables import Variable
 from .bodies import Array, Body, JointTree, joint_tree
+from .derivatives import joint_forces, joint_motions
 from .recursions import (
     effort_bounds,
     hybrid_by_factors,
@@ -60,7 +61,29 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         c_function(f"void {head}", results, varied(results.values(), held=HELD)) for head, results in functions.items()
     ]
     texts += _forward_dynamics(constants, bodies, joint, armature, in_all)
-    return "\n".join([MECHANISM, *texts])
+    motions = joint_motions(constants, joint, v, a, gravity)
+    terms = _terms("motion", ("s", "psi", "chi"), motions)
+    terms |= _terms("force", ("coriolis", "inertial", "by_q", "by_v"), joint_forces(constants, bodies, motions))
+    slopes = c_function(f"void joint_forces({motion}, JointMotion motion[N_BODIES], JointForce force[N_BODIES])", terms)
+    return "\n".join([MECHANISM, *texts, "#ifndef IS_COMPLEX", _tree(constants), slopes + "#endif\n"])
+
+
+def _tree(robot: JointTree) -> str:
+    """Return the joints' parents, and of each the independent joint that it follows by a ratio."""
+    leaders = np.abs(robot.G).argmax(axis=1)
+    ratios = robot.G[range(len(leaders)), leaders]
+    rows = {"int PARENT": robot.parent, "int LEADER": leaders.tolist(), "double RATIO": ratios.tolist()}
+    lines = [f"static const {name}[N_BODIES] = {{{', '.join(map(repr, row))}}};" for name, row in rows.items()]
+    return "\n".join([*lines, f"enum {{ END_BODY = {robot.path[-1]} }};"])
+
+
+def _terms(name: str, fields: Sequence[str], values: Sequence[Array]) -> dict[str, Value]:
+    """Return the elements of the fields of an array of structs."""
+    return {
+        f"{name}[{i}].{field}[{k}]": each
+        for field, rows in zip(fields, values)
+        for (i, k), each in np.ndenumerate(rows)
+    }
 
 
 def _forward_dynamics(
