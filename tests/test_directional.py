@@ -180,6 +180,17 @@ def test_derivatives_are_those_of_central_differences(case, complex_numbers):
         assert (np.abs(ours - theirs) / scale).max() <= (1e-6 if complex_numbers else 1e-5)
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_the_jacobian_is_that_of_complex_steps(case):
+    name, control, settings = CASES[case]
+    engine, rng = Derivatives(model(name, control)), np.random.default_rng(8)
+    first = 0 if control == "effort" else engine.model.index("tau_ext")
+    for _ in range(25):
+        values = at_random(engine, rng, **{"f_ext": rng.normal(0, 5, 3).tolist()} | settings)
+        ours, steps = engine.slopes(values)[:, first:], engine.jacobian(values)[-engine.n :, first:]
+        assert np.abs(ours - steps).max() <= 1e-12 * np.abs(steps).max()
+
+
 @pytest.mark.parametrize("rigid", [False, True])
 def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
     engine = Derivatives(model("ur5", "effort"))

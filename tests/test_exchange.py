@@ -7,6 +7,7 @@ import re
 import xml.etree.ElementTree as ET
 import zipfile
 from dataclasses import replace
+from typing import Any
 
 import fmpy
 import numpy as np
@@ -521,6 +522,65 @@ def test_directional_derivatives_are_those_of_the_rates_in_both_kinds(fmus):
             found = instance.getDirectionalDerivative(unknown, [vr[name]], [1.0])
             np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
     arm.free()
+
+
+def move(model, y):
+    model.y = y
+    return model
+
+
+CHANGES = {
+    "states": lambda model: move(model, [0.4, 0.2, 0.6, 0.5]),
+    "a state alone": lambda model: model.set(v=[-0.8, 0.3]),
+    "efforts": lambda model: model.set(tau_ext=[0.3, -0.2]),
+    "a force": lambda model: model.set(f_ext=[2.0, -1.0, 0.5]),
+    "a joint that sticks": lambda model: move(model, [0.4, 0.2, 0.0, 0.5]).event(),
+    "a joint at its stop": lambda model: move(model, [0.4, 2.0, 0.3, 0.0]).event(),
+    "a state restored": lambda model: model.setFMUState(model.saved),
+    "the time of a sample": lambda model: (model.setTime(0.1), model.enterEventMode()),
+    "a step": lambda model: model.doStep(0.0, 0.05),
+    "a parameter": lambda model: (model.reset(), model.set(payload=0.4), model.enterInitializationMode()),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_of_anything_gives_another_jacobian(fmus, change):
+    """The columns are those of another instance that is asked for one direction at a point."""
+    starts: dict[str, Any] = {
+        "friction": [0.3, 0.0],
+        "q_max": [3.0, 2.0],
+        "v_start": [0.5, -0.4],
+        "tau_ext": [0.1, 0.2],
+    }
+    if change == "the time of a sample":
+        starts["control_period"] = 0.1
+    if change == "a step":
+        first, second = (Driver(fmus["joint"]).initialise(**starts).slave for _ in range(2))
+    else:
+        first, second = (Model(fmus["joint"], **starts) for _ in range(2))
+        first.go()
+    vr = Model(fmus["joint"]).vr
+    unknown = [vr[name] for name in vr if name.startswith("der(")]
+    known = [vr[name] for name in vr if re.match(r"[qv]\[|tau_ext|f_ext", name)]
+
+    def jacobian():
+        twice = [[first.getDirectionalDerivative(unknown, [k], [1.0]) for k in known] for _ in range(2)]
+        state, alone = first.getFMUState(), []
+        for k in known:
+            second.setFMUState(state)
+            alone.append(second.getDirectionalDerivative(unknown, [k], [1.0]))
+        for columns in twice:
+            np.testing.assert_allclose(columns, alone, rtol=1e-10, atol=1e-10 * np.abs(alone).max())
+        return np.array(alone)
+
+    if change == "the time of a sample":
+        first.set(q_des=[0.9, -0.5])
+    if change == "a state restored":
+        first.saved = first.getFMUState()
+        first.y = [0.1, 0.9, 1.0, -1.0]
+    before = jacobian()
+    CHANGES[change](first)
+    assert np.abs(jacobian() - before).max() > 1e-3
 
 
 def test_a_derivative_of_what_has_none_is_refused(fmus):
