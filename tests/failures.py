@@ -113,6 +113,13 @@ FAILURES = {
         ("sampling",),
         "too high for control_period = 0.004 s, control_delay = 0.03 s",
     ),
+    "a late controller that throws joints to their limits": Failure(
+        "arm",
+        "task",
+        {"control_period": 0.005, "control_delay": 0.0489, "Kp": 342.4, "Kd": 30.82, "x_des": (-0.107, 0.2)},
+        ("sampling", "limit"),
+        "control_delay = 0.0489 s: the phase margin is -24.7°",
+    ),
     "a slow controller with limited motors": Failure(
         "ur5",
         "joint",

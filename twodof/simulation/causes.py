@@ -74,14 +74,8 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     found = [*_degrees(judge), *_beyond_limits(judge)]
     ill = bool(missed) or motion == "diverging"
     if missed:
-        found += [
-            *_reach(judge, missed),
-            *_gains(judge, missed),
-            *_feedforward(judge, missed),
-            *_load(judge),
-            *_friction(judge, missed),
-        ]
-        found += [*_singular(judge), *_slow(judge, missed)]
+        found += [*_reach(judge, missed), *_gains(judge, missed), *_feedforward(judge, missed), *_load(judge)]
+        found += [*_friction(judge, missed), *_singular(judge), *_slow(judge, missed)]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *_sampled(judge)]
     if missed:
@@ -115,9 +109,8 @@ def _beyond_limits(judge: Judge) -> Iterator[Cause]:
         for joint, unit, peak, limit, share in zip(setup.joints, setup.units, peaks, bounds, use):
             if share > 1.0 + EXACT:
                 of = units.get(unit, "")
-                text = (
-                    f"joint '{joint}' has a peak {what} of {peak:.4g} {of}, beyond the URDF's limit of {limit:.4g} {of}"
-                )
+                beyond = f"beyond the URDF's limit of {limit:.4g} {of}"
+                text = f"joint '{joint}' has a peak {what} of {peak:.4g} {of}, {beyond}"
                 yield Cause(kind, text, float(share), joint)
 
 
@@ -234,6 +227,7 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
 def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup = judge.setup
     friction, v = setup.given("friction"), np.abs(judge.end("v"))
+    own = {name: joint.friction for name, joint in (setup.robot.joints if setup.robot else {}).items()}
     for i, joint in enumerate(setup.joints[: len(friction)]):
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > FLOOR if judge.wanted("q").size else bool(missed)
         moved = max(0.0, float(judge.moved[i]))
@@ -241,6 +235,7 @@ def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         if friction[i] > 0.0 and off and (held or v[i] <= CREEPING * judge.speed[i]):
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"
+            text += "; raise Kp" * bool(judge.aims and friction[i] <= own.get(joint, 0.0))
             share = 1.0 - moved / judge.duration if held else 0.0
             yield Cause("friction", f"joint '{joint}' sticks: {text}", share, joint, moved if held else None)
 
@@ -276,9 +271,24 @@ def _sampled(judge: Judge) -> Iterator[Cause]:
     if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
         gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
         what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
-        often = f"reverses every {setup.step / turns[i]:.2g} s"
-        text = f"joint '{setup.joints[i]}' {often}: the gains{gains} are too high for {what}"
-        yield Cause("sampling", text, float(turns[i]), setup.joints[i])
+        text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: the gains{gains} are too high"
+        yield Cause("sampling", f"{text} for {what}", float(turns[i]), setup.joints[i])
+    elif any(sampling):
+        yield from _unstable(judge, *sampling)
+
+
+def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
+    """Yield a cause if gains and their delay have a negative phase margin, even while limits hold the joints."""
+    for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
+        p, d = judge.given(stiff), judge.given(damp)
+        crossing = np.sqrt(0.5 * (d * d + np.sqrt(d**4 + 4.0 * p * p)))  # rad/s, of (d s + p) / s²
+        margins = np.arctan2(d * crossing, p) - crossing * (0.5 * period + delay)
+        if margins.min(initial=0.0) < 0.0:
+            i = int(margins.argmin())
+            gains = f"{stiff}[{i + 1}] = {p[i]:g} s⁻² and {damp}[{i + 1}] = {d[i]:g} s⁻¹ are too high"
+            what = f"control_period = {period:g} s and control_delay = {delay:g} s"
+            text = f"{gains} for {what}: the phase margin is {np.degrees(margins[i]):.3g}°"
+            yield Cause("sampling", text, -float(margins[i]))
 
 
 def _sampling(judge: Judge, i: int) -> Iterator[str]:
@@ -338,6 +348,5 @@ def _slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
             stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
             ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
-            heavy = max(ratios, default=0.0) > OVERDAMPED
-            remedy = f"raise {stiff}, or lower {damp}" if heavy else "raise the gains"
+            remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > OVERDAMPED else "raise the gains"
             yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or {remedy}", left)
