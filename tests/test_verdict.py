@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import failures
 import numpy as np
 import pytest
 from failures import FAILURES, ROBOTS, Failure, fmu_of, good_runs
+from page_causes import page_causes
 from scipy.optimize import brute, differential_evolution
 from scipy.spatial.transform import Rotation
 from sinks import Memory
@@ -30,18 +31,48 @@ from twodof.simulation.verdict import _also
 STEP = 0.001
 
 
+class Kept(twodof.Sink):
+    """The run and its samples."""
+
+    def begin(self, run: twodof.Experiment) -> Kept:
+        self.run = run
+        self.samples: list[twodof.Sample] = []
+        return self
+
+    def write(self, sample: twodof.Sample) -> None:
+        self.samples.append(sample)
+
+
+class Failed(NamedTuple):
+    """A failure, its bag and verdict, and its samples."""
+
+    failure: Failure
+    bag: Path
+    verdict: twodof.Verdict
+    kept: Kept
+
+
 @pytest.fixture(scope="module", params=list(FAILURES))
-def failed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Failure, Path, Any]:
-    failure = FAILURES[request.param]
+def failed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Failed:
+    failure, kept = FAILURES[request.param], Kept()
     bag = tmp_path_factory.mktemp("failed") / "bag"
-    return failure, bag, failures.run(failure, twodof.Bag(bag)).verdict
+    return Failed(failure, bag, failures.run(failure, twodof.Bag(bag), kept).verdict, kept)
 
 
-def test_the_first_line_names_the_cause_of_a_failure(failed: tuple[Failure, Path, twodof.Verdict]) -> None:
-    failure, _, verdict = failed
+def test_the_first_line_names_the_cause_of_a_failure(failed: Failed) -> None:
+    failure, _, verdict, _ = failed
     assert failure.words in verdict.lines[0]
     assert verdict.causes[0].kind == failure.kinds[0]
     assert {*failure.kinds} <= {cause.kind for cause in verdict.causes}
+
+
+def test_the_page_names_the_same_causes_in_the_same_order(failed: Failed) -> None:
+    """For the same samples; the root cause concerns the same joint or setting."""
+    found = page_causes(failed.kept.run, failed.kept.samples)
+    kinds = [[*dict.fromkeys(each)] for each in ([c["kind"] for c in found], [c.kind for c in failed.verdict.causes])]
+    assert kinds[0] == kinds[1]
+    if joint := failed.verdict.causes[0].joint:
+        assert joint in found[0]["text"] or "rad: " in found[0]["text"]
 
 
 @pytest.mark.parametrize(
@@ -79,9 +110,9 @@ def test_a_line_names_each_joint_once() -> None:
 
 
 def test_a_bag_a_figure_and_a_page_say_the_same(
-    failed: tuple[Failure, Path, twodof.Verdict], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    failed: Failed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _, bag, verdict = failed
+    _, bag, verdict, _ = failed
     assert twodof.read_bag(bag).verdict == verdict == twodof.verdict(bag)
     assert main(["info", str(bag)]) == 0
     assert f"verdict      {verdict.lines[0]}\n" in capsys.readouterr().out
@@ -103,9 +134,11 @@ def test_a_target_that_changed_late_is_named() -> None:
 def test_good_runs_raise_no_alarm(robot: str) -> None:
     count = 0
     for run in good_runs(robot):
-        verdict = twodof.simulate(run).verdict
+        kept = Kept()
+        verdict = twodof.simulate(run, kept).verdict
         assert verdict.outcome in ("reached", "followed"), verdict.lines
         assert not verdict.causes, verdict.lines
+        assert page_causes(run, kept.samples) == []
         count += 1
     assert count == 4
 
@@ -353,11 +386,3 @@ def test_a_joint_sticks_from_its_last_motion_on() -> None:
     assert "'joint1' sticks: its friction of 0.05 N·m stops it short" in creeping.verdict.lines[0]
     freed = twodof.simulate(fmu, settings={**settings, "friction": 0.0, "Kd": 10.0}, stop_time=5.0).verdict
     assert freed.outcome == "reached" and not freed.causes
-
-
-class Kept(twodof.Sink):
-    def __init__(self) -> None:
-        self.samples: list[twodof.Sample] = []
-
-    def write(self, sample: twodof.Sample) -> None:
-        self.samples.append(sample)

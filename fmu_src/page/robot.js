@@ -59,6 +59,12 @@ export class Robot {
     return chain;
   }
 
+  /** Indices of the joints that move the end effector. */
+  movers() {
+    const columns = this.chain().map((link) => this.facts.links[link].column);
+    return [...new Set(columns)].filter((column) => column >= 0);
+  }
+
   /**
    * A ball outside of which no target can be reached: about the first joint that moves the frame, as
    * far as all that follow are long; and the links to the frame.

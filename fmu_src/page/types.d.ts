@@ -9,6 +9,8 @@ interface JointFacts {
   low: number | null;
   high: number | null;
   effort: number | null;
+  velocity: number | null;
+  damping: number;
 }
 
 interface Link {
@@ -46,6 +48,8 @@ interface Facts {
   remarks: string[];
   joints: JointFacts[];
   variables: Variable[];
+  /** Kinds of causes in their order. */
+  causes: string[];
   links: Link[];
   frameLink: number;
   shapes: { link: number; placement: number[]; colour: number[] }[];

@@ -1,178 +1,176 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
-import { base, originOf } from "./matrices.js";
+import { Search, off, solved, squared } from "./search.js";
 
 /** @typedef {import("./robot.js").Robot} Robot */
 
+/**
+ * A cause in words, and its kind, one of those in twodof/simulation/causes.py, with the share of the time or of a limit
+ * by which causes of one kind are ranked.
+ */
+/** @typedef {{kind: string, text: string, share: number, joint: number}} Cause */
+
 const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
+const HELD = 1e-3; // m or rad: a smaller error of an output that is held, and that only falls, is no failure
 const SETTLE = 1; // s after a change of the target, during which only permanent causes are named
 const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the share from which on a state is a cause
-const SCATTERED = 400, IMPROVED = 6, TRIES = 40; // nearest reachable point: starts, improved starts, steps of each
-const SINGULAR = 0.02; // ratio of the smallest to the largest singular value
+const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
 const CREEPING = 1e-5; // rad/s or m/s
 const FEWEST = 0.2; // damping ratio below which the damping is insufficient
+const TAIL = 256, FAST = 0.25; // examined last samples, and reversals in the time of a step that are too many
+const GAINS = [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]]; // of position or joints, and of orientation
 
 export class Verdict {
   began = 0; // sample at which the target was changed
   target = "";
   way = [0, 0]; // errors of position or joints (m or rad) and orientation (rad) at that time
-  asked = ""; // target and limits of the latest search, and what it found
-  best = { point: [0], distance: 0 };
 
   /** @param {Robot} robot */
   constructor(robot) {
     this.session = robot.session;
     this.robot = robot;
     this.joints = robot.facts.joints;
+    this.search = new Search(robot);
   }
 
   /** @returns {string[]} Lines of the verdict at the latest sample. */
   lines() {
-    const { session } = this, last = session.count - 1, turn = this.robot.turnError(last);
-    if (!session.follows) return this.atLimits();
-    const errors = [session.error(), Number.isNaN(turn) ? 0 : turn];
-    const target = ["x_des", "quat_des", "q_des"].map((group) => session.held(group).join()).join(";");
-    if (target !== this.target || last < this.began) [this.target, this.began, this.way] = [target, last < this.began ? 0 : last, errors];
-    const missed = errors.map((error, i) => !(error <= Math.max(BAND * this.way[i], FLOOR)));
-    const waited = session.time(last) - session.time(this.began) >= SETTLE;
-    const beyond = this.beyond();
-    if (!missed.includes(true)) return beyond.map((text) => `reached; but ${text}`).slice(0, 1);
-    const causes = [...this.degrees(), ...this.reach(missed[0], waited), ...this.gains(missed), ...this.atLimits()];
-    if (waited)
-      causes.push(...this.friction(), ...this.saturated(), ...this.loads(), ...this.damping(missed), ...this.singular());
-    causes.push(...beyond);
+    const causes = this.causes().map(({ text }) => text);
+    if (!this.session.follows) return causes;
+    if (!this.missed().includes(true)) return causes.slice(0, 1).map((text) => `reached; but ${text}`);
     return causes.slice(0, 3).map((text, i) => (i ? `also ${text}` : `not reached: ${text}`));
+  }
+
+  /** @returns {Cause[]} Causes at the latest sample, the root first. */
+  causes() {
+    const { session } = this, last = session.count - 1;
+    if (!session.follows) return this.atLimits();
+    const target = ["x_des", "quat_des", "q_des"].map((group) => session.held(group).join()).join(";");
+    if (target !== this.target || last < this.began) {
+      this.target = target;
+      this.began = last < this.began ? 0 : last;
+      this.way = this.errors(last);
+    }
+    const missed = this.missed(), found = [...this.degrees(), ...this.beyond()];
+    const waited = session.time(last) - session.time(this.began) >= SETTLE;
+    if (missed.includes(true)) found.push(...this.reach(missed[0], waited), ...this.gains(missed), ...this.atLimits());
+    if (missed.includes(true) && waited) {
+      found.push(...this.loads(), ...this.friction(), ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
+      found.push(...this.damping(missed), ...this.singular(), ...this.slow(missed));
+    }
+    return this.ranked(found);
+  }
+
+  /** Causes in the order of their kinds; a joint at a limit is last if another cause drives it there. */
+  /** @type {(found: Cause[]) => Cause[]} */
+  ranked(found) {
+    const order = this.robot.facts.causes, driven = found.some(({ kind }) => kind === "limit") ? this.driven() : [];
+    const motors = Math.max(0, ...found.filter(({ kind }) => kind === "saturation").map(({ share }) => share));
+    /** @type {(cause: Cause) => number} */
+    const rank = ({ kind, share, joint }) => order.indexOf(kind === "limit" && (share < motors || driven[joint]) ? "drag" : kind);
+    return found.sort((a, b) => rank(a) - rank(b) || b.share - a.share);
+  }
+
+  /** Whether the controller pulls each joint away from the nearer limit. */
+  driven() {
+    const { session } = this, q = [...session.at("q")], wanted = session.held("q_des");
+    let pull = wanted.length ? off(wanted, q) : q.map(() => 0);
+    if (session.groups.has("x_des") && !session.groups.has("quat_des")) {
+      const J = this.search.jacobian(q), size = J.flat().reduce((sum, value) => sum + value * value, 1e-18);
+      const y = solved(squared(J, SINGULAR * SINGULAR * size), off(session.held("x_des"), this.search.pointOf(q)));
+      pull = J.map((row) => row.reduce((sum, value, a) => sum + value * y[a], 0));
+    }
+    return q.map((value, i) => (2 * value > this.search.limits(i)[0] + this.search.limits(i)[1] ? pull[i] < 0 : pull[i] > 0));
+  }
+
+  /** @type {(k: number) => number[]} Errors in sample k of position or joints, and of orientation; 0 without a target. */
+  errors(k) {
+    return [this.session.error(k), this.session.groups.has("quat_des") ? this.robot.turnError(k) : 0];
+  }
+
+  /** Whether position or joints, and orientation, are not at their targets in the last tenth of the time. */
+  missed() {
+    const late = this.picked(0.1).map((k) => this.errors(k));
+    return this.way.map((way, i) => {
+      const falls = way <= FLOOR && late.every((errors, k) => !k || errors[i] <= late[k - 1][i]);
+      return !(Math.max(...late.map((errors) => errors[i])) <= Math.max(BAND * way, falls ? HELD : FLOOR));
+    });
+  }
+
+  /** Numbers of evenly spaced samples since the last change of the target, or of the last `part` of that time. */
+  picked(part = 1) {
+    const last = this.session.count - 1, count = Math.floor(part * (last - this.began)), found = [];
+    const stride = Math.max(1, Math.ceil(count / LOOKED_AT));
+    for (let k = last; k >= last - count; k -= stride) found.unshift(k);
+    return found;
+  }
+
+  /** Shares of these samples, and of their last quarter, with a condition. */
+  /** @type {(so: (k: number) => boolean) => number[]} */
+  shares(so) {
+    return [1, 0.25].map((part) => this.picked(part)).map((each) => each.filter(so).length / each.length);
   }
 
   degrees() {
     const { session, joints } = this;
     return ["q_des", "q_start"].flatMap((group) => session.held(group).flatMap((value, i) => {
-      const { prismatic, low, high } = joints[i], meant = (value * Math.PI) / 180;
-      const fits = meant >= (low ?? -Infinity) && meant <= (high ?? Infinity);
-      return !prismatic && Math.abs(value) > 2 * Math.PI && fits ? [`${group}[${i + 1}] = ${short(value)} rad: ${short(value)}°? That is ${short(meant)} rad`] : [];
+      const { prismatic } = joints[i], [low, high] = this.search.limits(i), meant = (value * Math.PI) / 180;
+      const fits = meant >= low && meant <= high;
+      const text = `${group}[${i + 1}] = ${short(value)} rad: ${short(value)}°? That is ${short(meant)} rad`;
+      return !prismatic && Math.abs(value) > 2 * Math.PI && fits ? [cause("degrees", text)] : [];
     }));
   }
 
-  /** Limits of a joint in this run. */
-  /** @type {(i: number) => number[]} */
-  limits(i) {
-    return ["q_min", "q_max"].map((side, k) => Number(this.session.values.get(`${side}[${i + 1}]`) ?? [-Infinity, Infinity][k]));
-  }
-
-  /** @type {(missed: boolean, waited: boolean) => string[]} */
+  /** @type {(missed: boolean, waited: boolean) => Cause[]} */
   reach(missed, waited) {
     const { session, joints, robot } = this, wanted = session.held("x_des");
     const outside = session.held("q_des").flatMap((value, i) => {
-      const [low, high] = this.limits(i), { name, prismatic } = joints[i], unit = prismatic ? "m" : "rad";
+      const [low, high] = this.search.limits(i), { name, prismatic } = joints[i], unit = prismatic ? "m" : "rad";
       const by = Math.max(low - value, value - high);
-      return by > 1e-9 && !this.degrees().length ? [`the target ${short(value)} ${unit} of joint '${name}' is out of reach by ${short(by)} ${unit}`] : [];
+      const text = `the target ${short(value)} ${unit} of joint '${name}' is out of reach by ${short(by)} ${unit}${!prismatic && Math.abs(value) > 2 * Math.PI ? "; is it in degrees?" : ""}`;
+      return by > 1e-9 && !this.degrees().length ? [cause("reach", text, by)] : [];
     });
     if (!wanted.length || !missed) return outside;
     const ball = robot.reach() ?? { centre: [0, 0, 0], radius: Infinity };
     const far = Math.hypot(...wanted.map((value, i) => value - ball.centre[session.axes[i]])) > ball.radius;
     if (!far && !waited) return outside;
-    const { point, distance } = this.nearest(wanted);
+    const { point, distance } = this.search.nearest(wanted);
     if (distance <= Math.max(BAND * this.way[0], FLOOR)) return outside;
     const millimetres = Math.max(...wanted.map(Math.abs)) > 10 ? "; is it in millimetres?" : "";
-    return [`target out of reach by ${short(distance)} m${millimetres}; the nearest reachable point is (${point.map(short).join(", ")}) m`];
+    const text = `target out of reach by ${short(distance)} m${millimetres}; the nearest reachable point is (${point.map(short).join(", ")}) m`;
+    return [cause("reach", text)];
   }
 
-  /** Position of the end effector along the task axes. */
-  /** @type {(q: number[]) => number[]} */
-  pointOf(q) {
-    const { robot } = this, end = originOf(robot.linksAt(q)[robot.facts.frameLink]);
-    return this.session.axes.map((axis) => end[axis]);
-  }
-
-  /** Jacobian of that position by differences: a row for each joint. */
-  /** @type {(q: number[]) => number[][]} */
-  jacobian(q) {
-    const h = 1e-6;
-    /** @type {(i: number, by: number) => number[]} */
-    const moved = (i, by) => this.pointOf(q.map((value, k) => (k === i ? value + by : value)));
-    return q.map((_, i) => {
-      const before = moved(i, -h);
-      return moved(i, h).map((value, k) => (value - before[k]) / (2 * h));
-    });
-  }
-
-  /** The reachable position nearest to a target, by damped least squares (Levenberg, 1944) from several starts. */
-  /** @param {number[]} wanted */
-  nearest(wanted) {
-    const limits = this.joints.map((_, i) => this.limits(i)), first = [...this.session.at("q")];
-    const asked = `${wanted}; ${limits}`;
-    if (asked === this.asked) return this.best;
-    let best = { point: this.pointOf(first), distance: Infinity };
-    for (let q of [first, ...this.scattered(limits, wanted)]) {
-      if (best.distance <= FLOOR) break;
-      let e = off(wanted, this.pointOf(q)), damping = 1e-3;
-      for (let k = 0; k < TRIES && Math.hypot(...e) > FLOOR / 10; k++) {
-        const rows = this.jacobian(q).map((row, i) => {
-          const slope = row.reduce((sum, value, a) => sum + value * e[a], 0);
-          return (slope > 0 && q[i] >= limits[i][1]) || (slope < 0 && q[i] <= limits[i][0]) ? row.map(() => 0) : row;
-        });
-        const y = solved(squared(rows, damping), e);
-        const next = q.map((value, i) => Math.min(Math.max(value + rows[i].reduce((sum, s, a) => sum + s * y[a], 0), limits[i][0]), limits[i][1]));
-        const left = off(wanted, this.pointOf(next)), gain = Math.hypot(...e) - Math.hypot(...left);
-        if (gain > 0) [q, e] = [next, left];
-        damping *= gain > 0 ? 0.3 : 10;
-        if (damping > 1e9 || (gain > 0 && gain < 1e-12)) break;
-      }
-      const distance = Math.hypot(...e);
-      if (distance < best.distance - 1e-9) best = { point: this.pointOf(q), distance };
-    }
-    [this.asked, this.best] = [asked, best];
-    return best;
-  }
-
-  /**
-   * The joint positions nearest to a target among evenly distributed ones within the limits: multiples of 1 / g,
-   * 1 / g², … with g ** (n + 1) = g + 1.
-   */
-  /** @type {(limits: number[][], wanted: number[]) => number[][]} */
-  scattered(limits, wanted) {
-    const ends = limits.map((pair) => pair.map((limit, side) => (Math.abs(limit) < 1e3 ? limit : [-Math.PI, Math.PI][side])));
-    let g = 2;
-    for (let k = 0; k < 40; k++) g = (1 + g) ** (1 / (limits.length + 1));
-    const starts = Array.from({ length: SCATTERED }, (_, k) => {
-      const q = ends.map(([low, high], i) => low + ((k / g ** (i + 1)) % 1) * (high - low));
-      return { q, distance: Math.hypot(...off(wanted, this.pointOf(q))) };
-    });
-    return starts.sort((a, b) => a.distance - b.distance).slice(0, IMPROVED).map(({ q }) => q);
-  }
-
-  /** @type {(missed: boolean[]) => string[]} */
+  /** @type {(missed: boolean[]) => Cause[]} */
   gains(missed) {
-    const zero = ["Kp", "Kp_rot"].flatMap((group, k) =>
-      missed[k] ? this.session.held(group).flatMap((gain, i) => (gain === 0 ? [`${group}[${i + 1}]`] : [])) : []);
-    return zero.length ? [`${zero.join(", ")} = 0: the controller does not reduce this error`] : [];
+    const zero = GAINS.flatMap(([stiff], k) =>
+      missed[k] ? this.session.held(stiff).flatMap((gain, i) => (gain === 0 ? [`${stiff}[${i + 1}]`] : [])) : []);
+    return zero.length ? [cause("gain", `${zero.join(", ")} = 0: the controller does not reduce this error`)] : [];
   }
 
-  /** Shares of the samples since the last change of the target, and of their last quarter, with a condition. */
-  /** @type {(so: (k: number) => boolean) => number[]} */
-  shares(so) {
-    const last = this.session.count - 1, stride = Math.max(1, Math.ceil((last - this.began) / LOOKED_AT)), found = [];
-    for (let k = last; k >= this.began; k -= stride) found.push(so(k));
-    const late = found.slice(0, (found.length >> 2) + 1);
-    return [found, late].map((each) => each.filter(Boolean).length / each.length);
+  /** @type {(missed: boolean[]) => Cause[]} */
+  feedforward(missed) {
+    const rates = [["xd_des", "xdd_des", "v_des", "a_des"], ["omega_des", "alpha_des"]];
+    return rates.flatMap((groups, k) => (missed[k] ? groups : [])).filter((group) => this.session.held(group).some(Boolean)).map((group) =>
+      cause("feedforward", `${group} = (${this.session.held(group).map(short).join(", ")}) is not 0, while the target rests`));
   }
 
   atLimits() {
-    const { session, robot } = this, q = session.at("q"), wanted = session.held("q_des");
-    const moving = robot.chain().map((link) => robot.facts.links[link].column), inSpace = session.groups.has("x_des");
+    const { session, robot } = this, q = session.at("q"), wanted = session.held("q_des"), inSpace = session.groups.has("x_des");
     return this.robot.stopped(session.now).flatMap((joint) => {
-      const i = this.joints.indexOf(joint), [low, high] = this.limits(i), side = 2 * q[i] < low + high ? "lower" : "upper";
-      const idle = inSpace ? !moving.includes(i) : wanted[i] === (side === "lower" ? low : high);
-      return idle ? [] : [`joint '${joint.name}' is at its ${side} limit`];
+      const i = this.joints.indexOf(joint), [low, high] = this.search.limits(i), side = 2 * q[i] < low + high ? "lower" : "upper";
+      const limit = side === "lower" ? low : high, [share] = this.shares((k) => session.value("q", k, i) === limit);
+      const idle = inSpace ? !robot.movers().includes(i) : wanted[i] === limit;
+      return idle ? [] : [cause("limit", `joint '${joint.name}' is at its ${side} limit`, share, i)];
     });
   }
 
   friction() {
     const { session } = this;
     return session.held("friction").flatMap((size, i) => {
-      const still = size > 0 && this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING)[1] > 0.9;
-      const astray = !session.groups.has("q_des") || session.value("q", session.count - 1, i) !== session.held("q_des")[i];
-      return still && astray ? [`joint '${this.joints[i].name}' sticks: its friction of ${short(size)} holds it`] : [];
+      const [still, late] = size > 0 ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
+      const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
+      return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} holds it`, still)] : [];
     });
   }
 
@@ -180,70 +178,111 @@ export class Verdict {
     const { session, joints } = this;
     return session.values.get("limit_effort") !== true ? [] : joints.flatMap(({ name, effort }, i) => {
       const shares = effort === null ? [0, 0] : this.shares((k) => Math.abs(session.value("tau", k, i)) >= effort * (1 - 1e-9));
-      return shares[0] > OFTEN && shares[1] > OFTEN ? [`the motor of joint '${name}' is saturated for ${Math.round(100 * shares[0])} % of the time`] : [];
+      const text = `the motor of joint '${name}' is saturated for ${Math.round(100 * shares[0])} % of the time`;
+      return shares[0] > OFTEN && shares[1] > OFTEN ? [cause("saturation", text, shares[0])] : [];
     });
   }
 
-  /** Lines of the verdict on efforts beyond the URDF's limits. */
+  /** Efforts and speeds beyond the URDF's limits. */
   beyond() {
-    const { session, joints } = this;
-    return session.values.get("limit_effort") === true ? [] : joints.flatMap(({ name, effort }, i) =>
-      effort !== null && this.shares((k) => Math.abs(session.value("tau", k, i)) > effort * (1 + 1e-9))[0] > 0
-        ? [`joint '${name}' needs an effort beyond the URDF's limit of ${short(effort)}`] : []);
+    return ["effort", "velocity"].flatMap((kind, side) => this.joints.flatMap((joint, i) => {
+      const limit = [joint.effort, joint.velocity][side] ?? Infinity, group = ["tau", "v"][side];
+      const peak = Math.max(...this.picked().map((k) => Math.abs(this.session.value(group, k, i))));
+      const text = `joint '${joint.name}' needs ${["an effort", "a speed"][side]} beyond the URDF's limit of ${short(limit)}`;
+      return peak > limit * (1 + 1e-9) ? [cause(kind, text, peak / limit)] : [];
+    }));
   }
 
+  /** Loads and the damping of joints, which the controller does not know. */
   loads() {
-    const { session } = this, { values } = session, found = [];
+    const { session } = this, { values } = session, found = [], unknown = "the controller does not know the";
     const payload = Number(values.get("payload") ?? 0);
-    if (payload && values.get("payload_known") !== true) found.push(`the controller does not know the payload of ${short(payload)} kg`);
+    if (payload && values.get("payload_known") !== true) found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, 1));
     for (const group of ["tau_ext", "f_ext"])
-      if (session.held(group).some(Boolean)) found.push(`${group} = (${session.held(group).map(short).join(", ")}) acts, which the controller does not know`);
+      if (session.held(group).some(Boolean))
+        found.push(cause("load", `${group} = (${session.held(group).map(short).join(", ")}) acts, which the controller does not know`, 0.5));
+    /** @type {(own: (damping: number, i: number) => boolean) => string[]} */
+    const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
+    const heavy = damped((size, i) => size > 2 * this.joints[i].damping), some = damped((size) => size > 0);
+    if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 0.4));
+    else if (some.length) found.push(cause("drag", `${unknown} damping of joints ${some.join(", ")} in the URDF`));
     return found;
   }
 
-  /** @type {(missed: boolean[]) => string[]} */
-  damping(missed) {
-    const { session } = this;
-    return [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]].flatMap(([stiff, damp], k) => {
-      const Kd = session.held(damp), i = session.held(stiff).findIndex((p, n) => p > 0 && Kd[n] < FEWEST * 2 * Math.sqrt(p));
-      return missed[k] && i >= 0 ? [`${damp}[${i + 1}] = ${short(Kd[i])} s⁻¹ damps too little: critical is ${short(2 * Math.sqrt(session.held(stiff)[i]))} s⁻¹`] : [];
+  /** A joint that reverses as fast as the controller's steps, or else gains with a negative phase margin. */
+  sampled() {
+    const { session, joints } = this, last = session.count - 1, first = Math.max(0, last + 1 - TAIL);
+    const [period, delay] = ["control_period", "control_delay"].map((name) => Number(session.values.get(name) ?? 0));
+    if (!period || last - first < 15) return [];
+    /** @type {(i?: number) => string} Settings of the controller and of a joint's encoder. */
+    const settings = (i) => ["control_period", "control_delay", `q_resolution[${i}]`].flatMap((name) => {
+      const value = Number(session.values.get(name) ?? 0);
+      return value ? [`${name} = ${short(value)} ${this.session.variable(name).unit}`] : [];
+    }).join(", ");
+    const turns = joints.map((_, i) => {
+      const v = Array.from({ length: last + 1 - first }, (__, k) => session.value("v", first + k, i));
+      const peak = Math.max(...this.picked().map((k) => Math.abs(session.value("v", k, i))), 1e-3);
+      const moves = v.reduce((sum, value) => sum + Math.abs(value), 0) / v.length > 1e-3 * peak;
+      return moves ? v.filter((value, k) => k && value * v[k - 1] < 0).length / (v.length - 1) : 0;
+    });
+    const most = Math.max(...turns), joint = turns.indexOf(most), step = this.robot.facts.step;
+    if (most * Math.max(step, period + delay) >= FAST * step) {
+      const often = `joint '${joints[joint].name}' reverses every ${short(step / most)} s`;
+      return [cause("sampling", `${often}: the gains are too high for ${settings(joint + 1)}`)];
+    }
+    return GAINS.flatMap(([stiff, damp]) => {
+      const Kd = session.held(damp), margins = session.held(stiff).map((p, i) => {
+        const crossing = Math.sqrt((Kd[i] ** 2 + Math.sqrt(Kd[i] ** 4 + 4 * p * p)) / 2); // rad/s, of (Kd s + Kp) / s²
+        return Math.atan2(Kd[i] * crossing, p) - crossing * (period / 2 + delay);
+      });
+      const i = margins.indexOf(Math.min(...margins));
+      return margins[i] < 0 ? [cause("sampling", `${stiff}[${i + 1}] and ${damp}[${i + 1}] are too high for ${settings()}`)] : [];
     });
   }
 
-  singular() {
-    const { session } = this, size = session.axes.length;
-    if (!session.groups.has("x_des") || size > this.joints.length) return [];
-    const A = squared(this.jacobian([...session.at("q")]), 1e-18), trace = A.reduce((sum, row, i) => sum + row[i], 0);
-    const inverse = A.reduce((sum, _, i) => sum + solved(A, base(i).slice(0, size))[i], 0); // ≥ 1 / σ_min²
-    return 1 / Math.sqrt(inverse * trace) < SINGULAR ? ["the arm is near a singularity"] : [];
+  /** @type {(missed: boolean[]) => Cause[]} */
+  damping(missed) {
+    const { session } = this;
+    return GAINS.flatMap(([stiff, damp], k) => {
+      const Kd = session.held(damp), Kp = session.held(stiff), i = Kp.findIndex((p, n) => p > 0 && Kd[n] < FEWEST * 2 * Math.sqrt(p));
+      if (!missed[k] || i < 0) return [];
+      return [cause("damping", `${damp}[${i + 1}] = ${short(Kd[i])} s⁻¹ damps too little: critical is ${short(2 * Math.sqrt(Kp[i]))} s⁻¹`)];
+    });
   }
+
+  /** A pose near a singularity late in the run, unless the joints that move the end effector cannot avoid it. */
+  singular() {
+    const { session, robot } = this, axes = [...session.axes, ...(session.groups.has("quat_des") ? [3, 4, 5] : [])];
+    if (!session.groups.has("x_des") || axes.length > robot.movers().length) return [];
+    const late = this.picked(0.25), near = late.filter((_, k) => k % Math.ceil(late.length / POSES) === 0).some((k) => {
+      const A = squared(this.search.jacobian([...session.at("q", k)], axes), 1e-18), trace = A.reduce((sum, row, i) => sum + row[i], 0);
+      const inverse = A.reduce((sum, row, i) => sum + solved(A, row.map((__, n) => Number(n === i)))[i], 0); // ≥ 1 / σ_min²
+      return 1 / Math.sqrt(inverse * trace) < SINGULAR;
+    });
+    return near ? [cause("singularity", "the arm is near a singularity")] : [];
+  }
+
+  /** Errors that still shrink, with the remaining time by their rate. */
+  /** @type {(missed: boolean[]) => Cause[]} */
+  slow(missed) {
+    const { session } = this, late = this.picked(0.2), end = late.length - 1, passed = session.time(late[end]) - session.time(late[0]);
+    return missed.flatMap((is, i) => {
+      const size = late.map((k) => this.errors(k)[i]), rate = Math.log(size[0] / size[end]) / passed;
+      const left = Math.log(Math.max(size[end] / Math.max(BAND * this.way[i], FLOOR), 1)) / rate;
+      const falls = is && end > 1 && size[end] > 0 && rate * passed > 1e-6 && size.every((value, k) => !k || value < size[k - 1]);
+      const what = i ? "orientation still approaches" : session.groups.has("q_des") ? "joints still approach" : "position still approaches";
+      return falls && left < 5000 * passed ? [cause("time", `the ${what}: 2 % takes about ${short(left)} s more, or raise the gains`, left)] : [];
+    });
+  }
+}
+
+/** @type {(kind: string, text: string, share?: number, joint?: number) => Cause} */
+function cause(kind, text, share = 0, joint = -1) {
+  return { kind, text, share, joint };
 }
 
 /** A number with four digits. */
 /** @type {(value: number) => string} */
 function short(value) {
   return String(Number((Math.abs(value) < 1e-9 ? 0 : value).toPrecision(4))).replace("-", "\u2212");
-}
-
-/** @type {(a: number[], b: number[]) => number[]} */
-function off(a, b) {
-  return a.map((value, i) => value - b[i]);
-}
-
-/** The product AᵀA of rows A, plus a number on the diagonal. */
-/** @type {(rows: number[][], more: number) => number[][]} */
-function squared(rows, more) {
-  return rows[0].map((_, a) => rows[0].map((_, b) => rows.reduce((sum, row) => sum + row[a] * row[b], a === b ? more : 0)));
-}
-
-/** Solution of A y = b for a positive definite matrix, by elimination. */
-/** @type {(A: number[][], b: number[]) => number[]} */
-function solved(A, b) {
-  const rows = A.map((row, i) => [...row, b[i]]), n = b.length;
-  for (let i = 0; i < n; i++)
-    for (let k = 0; k < n; k++) {
-      const factor = rows[k][i] / rows[i][i];
-      if (k !== i) for (let j = i; j <= n; j++) rows[k][j] -= factor * rows[i][j];
-    }
-  return rows.map((row, i) => row[n] / row[i]);
 }

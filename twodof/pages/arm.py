@@ -30,11 +30,13 @@ from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
 from ..plots.scripts import packed, script
 from ..ros.messages import JOINT_STATE, POINT, POSE, STREAM, definition
+from ..simulation.causes import KINDS
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables in a sample, in their order."""
+LIMITS = ("low", "high", "effort", "velocity")  # of a joint
 GRAIN = 65535  # resolution of vertices, as parts of a mesh's size
 POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
 PAGES = ("", ".html", ".htm")
@@ -210,6 +212,7 @@ def _facts(arm: Arm) -> tuple[dict[str, object], bytes]:
         **arm.facts,
         "joints": [_joint(name, urdf.joints.get(name)) for name in arm.facts["joints"]],
         "recorded": RECORDED,
+        "causes": [*KINDS],
         "links": links,
         "frameLink": number[arm.facts["frame"]],
         "shapes": [{"link": number[s.link], "placement": _matrix(s.transform), "colour": s.colour} for s in arm.shapes],
@@ -221,10 +224,10 @@ def _facts(arm: Arm) -> tuple[dict[str, object], bytes]:
 def _joint(name: str, joint: Joint | None) -> dict[str, object]:
     """Return an independent joint's facts; null for an unknown or missing limit."""
     if joint is None:
-        return {"name": name, "prismatic": False, "low": None, "high": None, "effort": None}
-    limits = {"low": joint.low, "high": joint.high, "effort": joint.effort}
+        return {"name": name, "prismatic": False, "damping": 0.0, **dict.fromkeys(LIMITS)}
+    limits = {limit: getattr(joint, limit) for limit in LIMITS}
     finite = {key: value if abs(value) < UNBOUNDED else None for key, value in limits.items()}
-    return {"name": name, "prismatic": joint.prismatic, **finite}
+    return {"name": name, "prismatic": joint.prismatic, "damping": joint.damping, **finite}
 
 
 def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], dict[str, int]]:

@@ -1,0 +1,44 @@
+"""The causes that the script of a page names for a run, computed by Node.js."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from scratch import run_folder
+from tools import needs
+
+import twodof
+from twodof.pages.arm import RECORDED, arm_of, arm_page
+
+ROOT = Path(__file__).parents[1]
+
+
+def page_causes(run: twodof.Experiment, samples: Sequence[twodof.Sample]) -> list[dict[str, Any]]:
+    """Return the page's causes after all samples of a run, the root first."""
+    scripts = run_folder() / "page-scripts"
+    if not scripts.exists():
+        shutil.copytree(ROOT / "fmu_src/page", scripts)
+        (scripts / "package.json").write_text('{"type": "module"}')
+    page = arm_page("", arm_of(run), {}).decode()
+    found = re.search(r'id="arm-facts">(.*?)</script>', page)
+    assert found is not None
+    targets = {name: run.fmu.vector(name) for name in RECORDED if name.endswith("_des")}
+    rows = [
+        [s.t, *(v for g in RECORDED for v in (map(s.inputs.get, targets[g]) if g in targets else getattr(s, g)))]
+        for s in samples
+    ]
+    inputs = [samples[0].inputs, *(sample.inputs for sample in samples)]
+    changes = [{} if new is old else new for old, new in pairwise(inputs)]
+    changes[0] = {**run.start_values, **inputs[0]}
+    text = json.dumps({"facts": json.loads(found[1]), "rows": rows, "changes": changes})
+    command = [needs("node"), str(ROOT / "tests/page_causes.mjs"), scripts.as_uri()]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    causes: list[dict[str, Any]] = json.loads(done.stdout)
+    return causes
