@@ -67,9 +67,10 @@ def test_the_first_line_names_the_cause_of_a_failure(failed: Failed) -> None:
 
 
 def test_the_page_names_the_same_causes_in_the_same_order(failed: Failed) -> None:
-    """For the same samples; the root cause concerns the same joint or setting."""
+    """For the same samples; the root cause concerns the same joint. A run in a page goes on: 5 s more are not slow."""
     found = page_causes(failed.kept.run, failed.kept.samples)
-    kinds = [[*dict.fromkeys(each)] for each in ([c["kind"] for c in found], [c.kind for c in failed.verdict.causes])]
+    expected = [c.kind for c in failed.verdict.causes if c.kind != "time" or c.share > 5.0]
+    kinds = [[*dict.fromkeys(each)] for each in ([c["kind"] for c in found], expected)]
     assert kinds[0] == kinds[1]
     if joint := failed.verdict.causes[0].joint:
         assert joint in found[0]["text"] or "rad: " in found[0]["text"]

@@ -12,6 +12,7 @@ import { Search, off, solved, squared } from "./search.js";
 
 const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
 const HELD = 1e-3; // m or rad: a smaller error of an output that is held, and that only falls, is no failure
+const PATIENCE = 5; // s: a run in a page goes on, so that it is slow only if it takes longer
 const SETTLE = 1; // s after a change of the target, during which only permanent causes are named
 const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the share from which on a state is a cause
 const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
@@ -271,7 +272,7 @@ export class Verdict {
       const left = Math.log(Math.max(size[end] / Math.max(BAND * this.way[i], FLOOR), 1)) / rate;
       const falls = is && end > 1 && size[end] > 0 && rate * passed > 1e-6 && size.every((value, k) => !k || value < size[k - 1]);
       const what = i ? "orientation still approaches" : session.groups.has("q_des") ? "joints still approach" : "position still approaches";
-      return falls && left < 5000 * passed ? [cause("time", `the ${what}: 2 % takes about ${short(left)} s more, or raise the gains`, left)] : [];
+      return falls && left > PATIENCE && left < 5000 * passed ? [cause("time", `the ${what}: 2 % takes about ${short(left)} s more, or raise the gains`, left)] : [];
     });
   }
 }
