@@ -1,11 +1,13 @@
 """Exports of bags as tables and single files, by independent readers; compressed chunks."""
 
 import csv
+import json
 
 import duckdb
 import numpy as np
 import pandas
 import pytest
+from failures import fmu_of
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
@@ -63,9 +65,56 @@ def test_one_mcap_file_has_all_messages(storage, native_path, tmp_path):
     assert np.array_equal(single.q, whole.q) and single.provenance["urdf"] == whole.provenance["urdf"]
 
 
+def test_a_lerobot_dataset_has_an_episode_for_each_bag(bag_path, native_path, tmp_path):
+    """In the columns and facts that LeRobot 0.4.4 itself writes and reads; an action applies from its sample on."""
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.2)
+    path = tmp_path / "arm.lerobot"
+    assert main(["export", str(bag_path), str(tmp_path / "bag"), "-o", str(path)]) == 0
+    file, bags = "chunk-000/file-000.parquet", [twodof.read_bag(bag) for bag in (bag_path, tmp_path / "bag")]
+    found = duckdb.read_parquet(str(path / "data" / file)).order("index")
+    counters = ["timestamp", "frame_index", "episode_index", "index", "task_index"]
+    assert found.columns == ["observation.state", "action", *counters]
+    assert [str(kind) for kind in found.types] == ["FLOAT[]", "FLOAT[]", "FLOAT", *["BIGINT"] * 4]
+    states, actions, *rest = zip(*found.fetchall())
+    assert np.array_equal(states, np.vstack([np.hstack([bag.q, bag.v]) for bag in bags]).astype(np.float32))
+    assert np.array_equal(actions, np.array([*[(0.2, 0.05)] * 25, *[(0.1, 0.2)] * 26, *[(0.2, 0.05)] * 21], np.float32))
+    k = [*range(51), *range(21)]
+    assert np.allclose(rest[0], np.array(k) / 100) and rest[1:] == [
+        (*k,),
+        (0,) * 51 + (1,) * 21,
+        (*range(72),),
+        (0,) * 72,
+    ]
+    episodes = duckdb.read_parquet(str(path / "meta/episodes" / file))
+    spans = episodes.project('episode_index, length, dataset_from_index, dataset_to_index, "data/file_index", tasks')
+    assert spans.fetchall() == [(0, 51, 0, 51, 0, ["follow the target"]), (1, 21, 51, 72, 0, ["follow the target"])]
+    info, stats = (json.loads((path / f"meta/{name}.json").read_text()) for name in ("info", "stats"))
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 100, 72)
+    assert info["features"]["action"] == {"dtype": "float32", "shape": [2], "names": ["x_des.x", "x_des.y"]}
+    assert stats["action"]["mean"] == pytest.approx(np.mean(actions, axis=0)) and stats["index"]["count"] == [72]
+    with pytest.raises(twodof.TwoDofError, match="exists, and is not replaced"):
+        twodof.export_bag(bag_path, path)
+
+
+@pytest.mark.parametrize(
+    ("control", "step", "name", "message"),
+    [
+        ("task", 0.01, "out.csv", "several become the episodes of a folder that ends in .lerobot"),
+        ("task", 0.02, "out.lerobot", "differ in joints, target or rate"),
+        ("task", 0.03, "out.lerobot", "no even rate of a whole number of Hz"),
+        ("effort", 0.01, "out.lerobot", "neither targets nor efforts; record them with `effort`"),
+    ],
+)
+def test_bags_of_no_dataset_are_refused(bag_path, tmp_path, control, step, name, message):
+    twodof.simulate(fmu_of("arm", control), twodof.Bag(tmp_path / "bag"), step=step, stop_time=0.06)
+    with pytest.raises(twodof.TwoDofError, match=message):
+        twodof.export_bag([bag_path, tmp_path / "bag"], tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("out.xlsx", "ends in .csv, .parquet or .mcap"), ("none/out.csv", "cannot write '.*none/out.csv'")],
+    [("out.xlsx", "ends in .csv, .parquet, .mcap or .lerobot"), ("none/out.csv", "cannot write '.*none/out.csv'")],
 )
 def test_what_cannot_be_exported_is_refused(name, message, bag_path, tmp_path):
     with pytest.raises(twodof.TwoDofError, match=message):

@@ -1,9 +1,10 @@
-"""Export bags as tables, or as one MCAP file, for tools that cannot open a rosbag2 folder."""
+"""Export bags as tables, one MCAP file or a dataset, for tools that cannot open a rosbag2 folder."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,33 +14,42 @@ from ..files import refusing, temporary_folder, write_file
 from ..plant.urdf import RobotError, read_urdf
 from ..version import install
 from .contents import storage_files
+from .lerobot import write_dataset
 from .provenance import robot_in
 from .reader import read_bag, whole_bag
 from .recording import Array, Recording
 from .recovery import copy_messages
 
-ENDINGS = (".csv", ".parquet", ".mcap")
+ENDINGS = (".csv", ".parquet", ".mcap", ".lerobot")
 
 
-def export_bag(bag: str | Path, output: str | Path) -> Path:
-    """Write a bag as a table or as one MCAP file, by the output's suffix; return its path.
+def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Path:
+    """Write a bag as a table, as one MCAP file or as a dataset, by the output's suffix; return its path.
 
     A table has one row for each sample. Its columns are "time"; for a joint "elbow", "elbow.position",
     "elbow.velocity" and "elbow.effort"; and for a task axis "y", "x.y" and "x_des.y". Unknown quantities have no
     column. Units are in the header of a CSV file, "elbow.position [rad]", and in the pandas attributes of a Parquet
-    file. Values are in SI units, in full precision. An MCAP file has all messages, with the provenance as metadata.
+    file. Values are in SI units, in full precision. An MCAP file has all messages, with the provenance as metadata. A
+    folder of the suffix .lerobot is a LeRobot dataset with an episode for each of several bags, with the joints'
+    positions and velocities as ``observation.state``, and as ``action`` the targets, or else the efforts.
 
     Raises:
         BagError: the bag is incomplete, the suffix is unknown, pandas or pyarrow is missing, or the file cannot be
             written.
     """
-    bag, path = path_of(bag, "bag"), path_of(output, "export")
+    bags = [path_of(each, "bag") for each in ([bag] if isinstance(bag, str | Path) else bag)]
+    path = path_of(output, "export")
     if path.suffix not in ENDINGS:
         raise BagError(f"'{path}': the name of an export ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if path.suffix == ".lerobot":
+        write_dataset([*map(read_bag, bags)], path)
+        return path
+    if len(bags) > 1:
+        raise BagError(f"'{path}' has one bag; several become the episodes of a folder that ends in .lerobot")
     if path.suffix == ".mcap":
-        content = _mcap(bag)
+        content = _mcap(bags[0])
     else:
-        columns = _columns(read_bag(bag))
+        columns = _columns(read_bag(bags[0]))
         content = _csv(columns) if path.suffix == ".csv" else _parquet(columns)
     with refusing(BagError, f"write '{path}'"):
         write_file(path, content)

@@ -56,7 +56,7 @@ def add(build: Parser) -> None:
     _add_native(build)
 
 
-def _add_native(build: argparse.ArgumentParser) -> None:
+def _add_native(build: Parser) -> None:
     """Add the options of native FMUs."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     flag("--native", help="build the FMU as compiled C, which needs no Python")

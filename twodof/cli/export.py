@@ -1,4 +1,4 @@
-"""Verb export: write a bag as a table, or as one MCAP file."""
+"""Verb export: write a bag as a table, one MCAP file or a dataset."""
 
 import argparse
 from pathlib import Path
@@ -10,9 +10,12 @@ from .printing import print_table
 
 def add(export: Parser) -> None:
     """Add the options of the verb."""
-    export.description = "Write a bag as a table with named columns and units, or as one MCAP file of all messages."
-    export.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
-    text = "output file: .csv, .parquet (extra 'sweep') or .mcap"
+    export.description = (
+        "Write a bag as a table with named columns and units, as one MCAP file of all messages, or bags as the episodes"
+        " of a LeRobot dataset."
+    )
+    export.add_argument("bags", metavar="BAG", type=Path, nargs="+", help="folder of the bag; several for .lerobot")
+    text = "output: .csv or .mcap, with the extra 'sweep' .parquet or a folder .lerobot"
     export.add_argument("-o", dest="output", required=True, type=not_empty, metavar="FILE", help=text)
 
 
@@ -20,6 +23,7 @@ def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     from ..bag.exports import export_bag
 
-    path = export_bag(options.bag, options.output)
-    print_table(("bag", str(options.bag)), ("file", f"{path} ({path.stat().st_size / 1024:.0f} KB)"))
+    path = export_bag(options.bags, options.output)
+    size = sum(file.stat().st_size for file in [path, *path.rglob("*")] if file.is_file())
+    print_table(("bag", ", ".join(map(str, options.bags))), ("file", f"{path} ({size / 1024:.0f} KB)"))
     return 0

@@ -47,7 +47,11 @@ EXAMPLES = {
         "twodof sweep --grid Kp=20:200:10 --grid Kd=5:40:8",
         "twodof sweep my_robot.fmu --range Kp=20:200 --random 500 -o my_sweep",
     ],
-    "export": ["twodof export my_bag -o my_bag.csv", "twodof export my_bag -o my_bag.mcap"],
+    "export": [
+        "twodof export my_bag -o my_bag.csv",
+        "twodof export my_bag -o my_bag.mcap",
+        "twodof export monday tuesday -o my_robot.lerobot",
+    ],
     "recover": ["twodof recover my_bag"],
 }
 MEANT = {

@@ -1,0 +1,112 @@
+"""Bags as a dataset for robot learning, in version 3.0 of LeRobot's form: an episode for each bag."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import BagError
+from ..files import refusing, temporary_folder
+from ..version import needing
+from .recording import Array, Recording
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+VERSION, TASK, FILE = "v3.0", "follow the target", "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+PLACE = {"data/chunk_index": 0, "data/file_index": 0, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+
+
+def write_dataset(runs: Sequence[Recording], path: Path) -> None:
+    """Write recordings as the episodes of a dataset, a new folder.
+
+    Its ``observation.state`` has positions and velocities of the joints. Its ``action`` has the target that applies
+    from a sample on: positions of the joints, or position and orientation of the end effector; or else the efforts.
+
+    Raises:
+        BagError: the folder exists or cannot be written, pandas or pyarrow is missing, the bags differ in joints,
+            target or rate, their rate is no whole number of Hz, or they have neither targets nor efforts.
+    """
+    if path.exists():
+        raise BagError(f"'{path}' exists, and is not replaced: remove it, or choose another name")
+    with needing(BagError, f"write '{path}'", "sweep"):
+        import pandas as pd
+    known = [({part: [*own] for part, own in _vectors(run).items()}, _rate(run)) for run in runs]
+    for run, own in zip(runs, known):
+        if own != known[0]:
+            raise BagError(f"'{run.path}' and '{runs[0].path}' differ in joints, target or rate")
+    (names, rate), tables, episodes, end = known[0], [], [], 0
+    for i, run in enumerate(runs):
+        tables.append(_frames(pd, run, rate, i, end))
+        span = {"dataset_from_index": end, "dataset_to_index": (end := end + len(run.t)), "length": len(run.t)}
+        stats = {f"stats/{name}/{key}": v for name, own in _statistics(tables[-1]).items() for key, v in own.items()}
+        episodes.append({"episode_index": i, "tasks": [TASK], **span, **PLACE, **stats})
+    frames = pd.concat(tables, ignore_index=True)
+    features: dict[str, dict[str, Any]] = {
+        name: {"dtype": str(np.asarray(frames[name][0]).dtype), "shape": [1], "names": None} for name in frames
+    }
+    features |= {part: {"dtype": "float32", "shape": [len(own)], "names": own} for part, own in names.items()}
+    info = {
+        **{"codebase_version": VERSION, "robot_type": runs[0].provenance.get("robot"), "fps": rate},
+        **{"total_episodes": len(runs), "total_frames": end, "total_tasks": 1, "splits": {"train": f"0:{len(runs)}"}},
+        **{"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200},
+        **{"data_path": f"data/{FILE}", "video_path": None, "features": features},
+    }
+    with (
+        needing(BagError, f"write '{path}'", "sweep"),
+        refusing(BagError, f"write '{path}'"),
+        temporary_folder(path.absolute().parent) as draft,
+    ):
+        for folder, table in (("data", frames), ("meta/episodes", pd.DataFrame(episodes))):
+            file = draft / "dataset" / folder / FILE.format(chunk_index=0, file_index=0)
+            file.parent.mkdir(parents=True)
+            table.to_parquet(file, index=False)
+        pd.DataFrame({"task_index": [0]}, index=[TASK]).to_parquet(draft / "dataset/meta/tasks.parquet")
+        for name, facts in (("info", info), ("stats", _statistics(frames))):
+            (draft / f"dataset/meta/{name}.json").write_text(json.dumps(facts, indent=4), "utf-8")
+        (draft / "dataset").rename(path)
+
+
+def _vectors(run: Recording) -> dict[str, dict[str, Array]]:
+    """Return states and actions: N values by name."""
+    parts = {"position": run.q, "velocity": run.v, "effort": run.tau}
+    own = {part: {f"{name}.{part}": v for name, v in zip(run.joints, values.T)} for part, values in parts.items()}
+    targets = {f"{joint}.position": q for joint, q in zip(run.joints, run.held("q_des", len(run.joints)).T)}
+    targets |= {f"x_des.{axis}": x for axis, x in zip(run.axes or "xyz", run.target.T)}
+    targets |= {f"quat_des.{axis}": values for axis, values in zip("xyzw", run.target_quat.T)}
+    ahead = {name: np.append(values[1:], values[-1]) for name, values in targets.items()}  # in effect after a sample
+    if not (action := ahead or own["effort"]):
+        raise BagError(f"'{run.path}' has neither targets nor efforts; record them with `effort`")
+    return {"observation.state": own["position"] | own["velocity"], "action": action}
+
+
+def _rate(run: Recording) -> int:
+    """Return the number of samples a second."""
+    steps = np.diff(run.t)
+    rate = round(1.0 / float(np.median(steps))) if len(steps) and min(steps) > 0.0 else 0
+    if not rate or abs(steps * rate - 1.0).max() > 0.1 or abs(steps.mean() * rate - 1.0) > 1e-3:
+        raise BagError(
+            f"'{run.path}' has no even rate of a whole number of Hz, as LeRobot needs; choose another `step`"
+        )
+    return rate
+
+
+def _frames(pd: Any, run: Recording, rate: int, episode: int, first: int) -> pd.DataFrame:
+    k = np.arange(len(run.t))
+    vectors = {part: [*np.column_stack([*own.values()]).astype(np.float32)] for part, own in _vectors(run).items()}
+    times = {"timestamp": (k / rate).astype(np.float32), "frame_index": k, "episode_index": np.full(len(k), episode)}
+    return pd.DataFrame({**vectors, **times, "index": first + k, "task_index": np.zeros(len(k), int)})
+
+
+def _statistics(frames: pd.DataFrame) -> dict[str, dict[str, list[float]]]:
+    found = {}
+    for name in frames:
+        values = np.stack(frames[name].to_list()).reshape(len(frames), -1)
+        moments = {key: getattr(np, key)(values, axis=0).tolist() for key in ("min", "max", "mean", "std")}
+        quantiles = {f"q{p:02}": np.percentile(values, p, axis=0).tolist() for p in (1, 10, 50, 90, 99)}
+        found[str(name)] = moments | quantiles | {"count": [len(values)]}
+    return found
