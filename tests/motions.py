@@ -58,13 +58,29 @@ def move(
     omega = 2.0 * np.pi * rng.uniform(0.1, 1.0, (5, n)) * fastest
     phase = rng.uniform(0.0, 2.0 * np.pi, (5, n))
     reaches = 0.5 * reach * rng.uniform(0.5, 1.0, (5, n)) * omega.min(axis=0) / omega
-    data, M, samples = mujoco.MjData(model), np.zeros((n, n)), []
-    data.qpos[:] = home
-    for k in range(round(seconds * 1000)):
-        ramp, angle = min(1.0, data.time / 2.0), omega * data.time + phase
+
+    def target(t: float) -> tuple[Array, Array, Array]:
+        ramp, angle = min(1.0, t / 2.0), omega * t + phase
         q = home + ramp * (reaches * np.sin(angle)).sum(axis=0)
         v = ramp * (reaches * omega * np.cos(angle)).sum(axis=0)
-        a = -ramp * (reaches * omega**2 * np.sin(angle)).sum(axis=0)
+        return q, v, -ramp * (reaches * omega**2 * np.sin(angle)).sum(axis=0)
+
+    return follow(model, target, seconds, home)
+
+
+def follow(model: Any, target: Any, seconds: float, home: Sequence[float]) -> Any:
+    """Positions, velocities and efforts at 100 Hz while a controller with a period of 1 ms follows a target.
+
+    Args:
+        model: MuJoCo's.
+        target: function of the time, s, to positions and their two derivatives.
+        seconds: duration.
+        home: positions at the beginning.
+    """
+    data, M, samples = mujoco.MjData(model), np.zeros((model.nv, model.nv)), []
+    data.qpos[:] = home
+    for k in range(round(seconds * 1000)):
+        q, v, a = target(data.time)
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, M)
         effort = M @ (a + 40.0 * (v - data.qvel) + 400.0 * (q - data.qpos)) + data.qfrc_bias

@@ -17,7 +17,7 @@ Write and read bags:            Bag, read_bag, Recording, export_bag, read_comma
 Draw figures and pages:         plot, view, page, live, show
 Run it over many gains:         sweep, read_sweep
 Check an FMU of any vendor:     check, Check
-Fit a robot to its bags:        fit, Fit
+Fit a robot to its bags:        fit, Fit; excite, Excitation for a motion to record
 Linear models:                  linearise, LinearModel
 ROS 2 and Foxglove:             publish, publish_together, Publisher, Foxglove, layouts
 

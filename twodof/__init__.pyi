@@ -15,6 +15,8 @@ from .fmu import Fmu as Fmu
 from .fmu import load_fmu as load_fmu
 from .fmu.checking import Check as Check
 from .fmu.checking import check as check
+from .identification.excitation import Excitation as Excitation
+from .identification.excitation import excite as excite
 from .identification.fit_result import Fit as Fit
 from .identification.fitting import fit as fit
 from .linear import LinearModel as LinearModel

@@ -18,17 +18,21 @@ def add(fit: Parser) -> None:
     fit.description = (
         "Fit masses, friction and other parameters of a URDF to bags with positions and efforts. Writes robot.urdf,"
         " fit.json and fit.html, a page with its curves, into a folder. The last fifth of each bag is held out."
+        " With --design, write a motion to record instead."
     )
     option = fit.add_argument
     option("robot", type=Path, metavar="URDF", help="URDF or xacro file with the initial values")
-    option("bags", nargs="+", type=not_empty, metavar="BAG", help="bags of the robot")
+    bags = option("bags", nargs="+", type=not_empty, metavar="BAG", help="bags of the robot")
+    bags.required = False  # with nargs="*", bags after an option would be refused
     fit.add_repeatable(
         "--free",
         metavar="PATTERN",
         help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
         " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
     )
-    add_output(fit, "FOLDER", "folder of the fitted robot (fitted)")
+    text = "without bags: write a motion of S seconds as a CSV, whose recording tells most about the free parameters"
+    option("--design", type=float, metavar="S", help=text)
+    add_output(fit, "FOLDER|CSV", "folder of the fitted robot (fitted), or file of the motion (excite.csv)")
     text = "link of the payload (the last link, if there is only one)"
     option("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
     text = "gravity, m/s2 in the root frame (the run's, else 0 0 -9.81)"
@@ -40,6 +44,10 @@ def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     if not options.free:
         raise CommandLineError("name the free parameters with --free, for example --free 'friction[*]' --free payload")
+    if bool(options.bags) == (options.design is not None):
+        raise CommandLineError("name bags of the robot, or a motion to record with --design S, and not both")
+    if options.design is not None:
+        return _design(options)
     from ..identification.fitting import fit
     from ..simulation.progress import counting
 
@@ -65,9 +73,44 @@ def call(options: argparse.Namespace) -> int:
         f" --gravity {value.replace(',', ' ')}" if name == "gravity" else f" --set {name}={value}"
         for name, value in given.items()
     )
-    same = "".join(f" --lock {quote(lock)}" for lock in options.locks or ())
-    same += f" --frame {quote(options.frame)}" if options.frame else ""
     page = output / "fit.html"
     say(f"page: {page}" if page.exists() else f"no page: {install('view')}")
-    print_next(f"twodof build {quote(output / 'robot.urdf')}{same}{settings}")
+    print_next(f"twodof build {quote(output / 'robot.urdf')}{_same(options)}{settings}")
     return 0
+
+
+def _design(options: argparse.Namespace) -> int:
+    """Write a motion to record; return the exit status."""
+    from ..identification.excitation import FINE, excite
+    from ..simulation.progress import counting
+
+    output = Path(options.output or "excite.csv")
+    with counting("designing", "step", shown=sys.stderr.isatty()) as progress:
+        result = excite(
+            options.robot,
+            options.design,
+            options.free,
+            output=output,
+            lock=parse_locks(options.locks),
+            progress=progress,
+            **given_options(options, "frame", "gravity"),
+        )
+    if options.json:
+        print_json(output=str(output), factor=result.factor, ratios=dict(zip(result.names, result.ratios.tolist())))
+        return 0
+    print_table(*result.rows)
+    for remark in result.remarks:
+        say(f"note: {remark}")
+    start = ",".join(f"{q:.9g}" for q in result.q[0])
+    print_next(
+        f"twodof build {quote(options.robot)}{_same(options)} --control joint --set q_start={start} -o Robot.fmu",
+        f"twodof run Robot.fmu --input {quote(output)} --stop-time {options.design:g} --step {FINE:g} --effort",
+    )
+    return 0
+
+
+def _same(options: argparse.Namespace) -> str:
+    """Return the options that a build of the same robot needs."""
+    same = "".join(f" --lock {quote(lock)}" for lock in options.locks or ())
+    same += f" --frame {quote(options.frame)}" if options.frame else ""
+    return same + (f" --gravity {' '.join(map(repr, options.gravity))}" if options.gravity else "")

@@ -33,6 +33,7 @@ EXAMPLES = {
     "linearise": ["twodof linearise TwoDof-native.fmu", "twodof linearise my_robot.fmu --at q=0.5,0.35 --at Kp=100"],
     "fit": [
         "twodof fit my_robot.urdf my_bag --free 'friction[*]' --free payload",
+        "twodof fit my_robot.urdf --design 20 --free 'friction[*]' --free payload -o excite.csv",
         "twodof fit my_robot.urdf monday tuesday --free 'mass:*' --free 'com:*' --free 'inertia:*' -o fitted",
     ],
     "plot": [

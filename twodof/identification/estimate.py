@@ -87,7 +87,7 @@ def estimate(
     parameters: Parameters, stretches: Sequence[Stretch], finished: Callable[[], None] = lambda: None
 ) -> Estimate:
     """Return the most likely coordinates of the free parameters; ``finished`` is called after each of the PASSES."""
-    x, low, scales = parameters.coordinates(_typical(stretches))
+    x, low, scales = parameters.coordinates(typical(stretches))
     scales, low = np.append(scales, DELAY_SCALE), np.append(low, -np.inf)
     start = np.append(x, 0.0)
     z, evaluations = start.copy(), 0
@@ -109,7 +109,7 @@ def estimate(
     return _result(parameters, rows, sd, z, scales, evaluations, converged)
 
 
-def _typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
+def typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
     """Return the friction, damping and armature that would each explain a joint's efforts without other causes."""
     rms = {name: np.sqrt(np.mean(np.concatenate([getattr(s, name) for s in stretches]) ** 2, 0)) for name in "va"}
     effort = np.sqrt(np.mean(np.concatenate([s.tau for s in stretches]) ** 2, axis=0))
@@ -134,7 +134,7 @@ def _solve(
         return np.concatenate([*parts, (z - start) / (PRIOR * scales)])
 
     def rates(z: Array) -> Array:
-        return np.vstack([_information_root(parameters, rows, sd, z), np.diag(1.0 / (PRIOR * scales))])
+        return np.vstack([information_root(parameters, rows, sd, z), np.diag(1.0 / (PRIOR * scales))])
 
     inside = np.maximum(z, low + 1e-9 * scales)
     options = dict(bounds=(low, np.inf), x_scale=scales, max_nfev=steps)
@@ -145,7 +145,7 @@ def _solve(
         raise InputError(f"masses, efforts or speeds are too large or too small: {error}") from error
 
 
-def _information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:
+def information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:
     """Return the Jacobian of the whitened residuals with respect to the coordinates and, last, the delay."""
     dynamics = parameters.dynamics(parameters.values(z[:-1]))
     rates = parameters.rates(z[:-1])[1]
@@ -176,7 +176,7 @@ def _result(
     evaluations: int,
     converged: bool,
 ) -> Estimate:
-    J = _information_root(parameters, rows, sd, z) * scales
+    J = information_root(parameters, rows, sd, z) * scales
     strengths, directions = np.linalg.eigh(J.T @ J)
     variances = 1.0 / (np.maximum(strengths, 0.0) + PRIOR**-2)
     unseen = strengths < SEEN**-2

@@ -63,14 +63,14 @@ def fit(
         BuildError: the URDF cannot be read.
         BagError: a bag cannot be read.
     """
-    _check(output, gravity)
+    if output is not None:
+        check_folder(output)
+    check_gravity(gravity)
     path, patterns = Path(urdf), [free] if isinstance(free, str) else free
     text = read_text(path, None)
-    read, locked, robot = _robots(path.name, text, frame, lock or {}, patterns)
+    read, locked, robot = read_robot(path.name, text, frame, lock or {}, patterns)
     recordings = _recordings(bags)
     parameters = Parameters(locked, robot, patterns, gravity or _recorded_gravity(recordings))
-    if not parameters.free:
-        raise InputError("`free` names no parameter")
     fitted, held = stretches(recordings, robot)
     _check_units(parameters, fitted)
     finished = _counter(progress, PASSES + 2 * len(held))
@@ -83,10 +83,8 @@ def fit(
     return result
 
 
-def _check(output: str | Path | None, gravity: Sequence[float] | None) -> None:
-    """Raise InputError if the output exists or the gravity is not finite."""
-    if output is not None:
-        check_folder(output)
+def check_gravity(gravity: Sequence[float] | None) -> None:
+    """Raise InputError if the gravity is not finite."""
     if gravity is not None and not np.isfinite(gravity).all():
         raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
 
@@ -103,7 +101,7 @@ def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callabl
     return finished
 
 
-def _robots(
+def read_robot(
     name: str, text: str, frame: str | None, lock: Mapping[str, float], patterns: Sequence[str]
 ) -> tuple[Urdf, Urdf, Robot]:
     """Return the robot of a URDF, the same with fixed joints, and the dynamics of the latter."""

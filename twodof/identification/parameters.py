@@ -117,7 +117,7 @@ class Parameters:
         gravity: initial gravity, m/s².
 
     Raises:
-        InputError: a pattern matches nothing.
+        InputError: a pattern matches nothing, or there is none.
     """
 
     def __init__(self, urdf: Urdf, robot: Robot, patterns: Sequence[str], gravity: Sequence[float]) -> None:
@@ -150,6 +150,8 @@ class Parameters:
                 raise InputError(f"`free` '{pattern}' matches no parameter{choice(pattern, names)}")
             chosen.update(matches)
         self.free = [free for name, free in known if name in chosen]
+        if not self.free:
+            raise InputError("`free` names no parameter")
         self.given = self.start.copy(float)
         self._settle()
         self.names = tuple(name for free in self.free for name in free.names)

@@ -97,7 +97,7 @@ def rows_of(
     block, about = 0, (values.offset, delay)
     for stretch in stretches:
         Y, G = regressors(robot, stretch, values.offset)
-        turning = _position_derivatives(robot, values, stretch, with_offsets)
+        turning = position_derivatives(robot, values, stretch, with_offsets)
         late = _delayed(stretch, delay)
         rate = np.gradient(late, stretch.step, axis=0)
         for i, rows in enumerate(found):
@@ -162,7 +162,7 @@ def _delayed(stretch: Stretch, delay: float) -> Array:
     return np.asarray(make_interp_spline(stretch.t, stretch.tau, 3)(np.clip(stretch.t - delay, *stretch.t[[0, -1]])))
 
 
-def _position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wanted: bool) -> Array:
+def position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wanted: bool) -> Array:
     """Return the derivative of the inverse dynamics with respect to positions, N × n × n; 0 if it is not needed."""
     model = robot.model.copy()
     model.gravity.linear = values.gravity

@@ -1,0 +1,126 @@
+"""Designed motions: their limits, and fits to MuJoCo's recordings of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from motions import assert_true, bag_of, follow, mujoco_model
+from scipy.interpolate import make_interp_spline
+from test_fit import ARM, FREE, GRAVITY, HIDDEN, JOINTS, TRUTH
+
+import twodof
+from twodof.cli.main import main
+from twodof.identification import excitation
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory: pytest.TempPathFactory) -> tuple[twodof.Excitation, Path]:
+    path = tmp_path_factory.mktemp("design") / "excite.csv"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(excitation, "GENERATIONS", 40)
+        return twodof.excite(ARM, 20.0, FREE, gravity=GRAVITY, output=path), path
+
+
+def test_a_motion_is_smooth_and_within_the_limits(tmp_path):
+    """With MuJoCo's efforts. Limits are so narrow that each of them matters."""
+    text = ARM.read_text("utf-8")
+    for low, high, effort, speed in ((-0.2, 1.0, 0.5, 1.5), (0.1, 0.9, 0.12, 20.0)):
+        limit = f'lower="{low}" upper="{high}" effort="{effort}" velocity="{speed}"'
+        text = re.sub(r"<limit [^@]*?/>", f"<limit @ {limit}/>", text, count=1)
+    (tmp_path / "arm.urdf").write_text(text.replace("<limit @", "<limit"), "utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(excitation, "GENERATIONS", 1)
+        motion = twodof.excite(tmp_path / "arm.urdf", 10.0, "friction[*]", gravity=(0, 0, 0))
+    model = mujoco_model(text.replace("<limit @", "<limit"), gravity=(0, 0, 0))
+    data, efforts = mujoco.MjData(model), []
+    for q, v, a in zip(motion.q, motion.v, motion.a):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, v, a
+        mujoco.mj_inverse(model, data)
+        efforts.append(data.qfrc_inverse.copy())
+    used = [
+        np.abs(motion.q - [0.4, 0.5]).max(axis=0) / [0.6, 0.4],
+        np.abs(motion.v).max(axis=0) / [1.5, 20.0],
+        np.abs(efforts).max(axis=0) / [0.5, 0.12],
+    ]
+    assert np.max(used) <= 1.0 and (np.max(used, axis=0) > 0.85).any(), used
+    spline = make_interp_spline(motion.t, motion.q, 5)
+    np.testing.assert_allclose(spline(motion.t, 1), motion.v, atol=1e-4)
+    np.testing.assert_allclose(spline(motion.t, 2)[5:-5], motion.a[5:-5], atol=1e-2)
+    for each in (motion.v, motion.a, motion.q - [0.4, 0.5]):
+        np.testing.assert_allclose(each[[0, -1]], 0.0, atol=1e-9)
+
+
+def test_intervals_are_narrower_than_with_random_motions(motion, tmp_path):
+    """The noise of efforts is the same for all motions."""
+    designed, _ = motion
+    rng, recorded = np.random.default_rng(5), []
+    k, t, path = np.array([1, 2, 3, 7, 11, 20]), designed.t[::5], designed.q[::5]
+    for number in range(4):
+        q = path
+        if number:  # random, within the same limits of position
+            waves = np.sin(np.pi / 10.0 * np.outer(t, k)) @ rng.normal(size=(6, 2))
+            q = waves * np.abs(path).max(axis=0) / np.abs(waves).max(axis=0)
+        splines = [make_interp_spline(t, q, 5).derivative(order) for order in range(3)]
+        model = mujoco_model(ARM.read_text("utf-8"), payload=0.15, end="EndEffector", **HIDDEN)
+        recorded.append(follow(model, lambda t, splines=splines: [each(t) for each in splines], 20.0, q[0]))
+    noise = 0.02 * np.sqrt(np.mean(recorded[1][2] ** 2, axis=0))
+    deviations = []
+    for number, (q, _, effort) in enumerate(recorded):
+        q, effort = q + 1e-4 * rng.normal(size=q.shape), effort + noise * rng.normal(size=q.shape)
+        result = twodof.fit(ARM, bag_of(tmp_path / f"bag{number}", JOINTS, q, effort), FREE, gravity=GRAVITY)
+        assert_true(result, TRUTH) if not number else None
+        deviations.append([p.deviation for p in result.parameters])
+    gain = np.exp(np.mean(np.log(np.array(deviations[1:]) / deviations[0]), axis=1))
+    assert designed.factor > 1.9 and gain.min() > 1.25, (designed.factor, gain)
+
+
+def test_the_command_writes_inputs_of_a_run(motion, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(excitation, "GENERATIONS", 40)
+    free = [word for pattern in FREE for word in ("--free", pattern)]
+    output, gravity = tmp_path / "excite.csv", [*map(str, GRAVITY)]
+    assert main(["fit", str(ARM), "--design", "20", *free, "--gravity", *gravity, "-o", str(output)]) == 0
+    printed = capsys.readouterr().out
+    assert f"are {motion[0].factor:.3g} times narrower" in printed and output.read_bytes() == motion[1].read_bytes()
+    assert "--control joint --set q_start=0,0 " in printed
+    options = twodof.FmuOptions(native=True, control="joint", q_start=(0.0, 0.0), settings={"friction": [0.08, 0.05]})
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)
+    command = [
+        "run",
+        str(fmu),
+        "--input",
+        str(output),
+        "--stop-time",
+        "20",
+        "--step",
+        "0.002",
+        "--effort",
+        "-o",
+        str(tmp_path / "bag"),
+    ]
+    assert main(command) == 0
+    fit = twodof.fit(ARM, tmp_path / "bag", "friction[*]", gravity=GRAVITY)
+    assert [p.after for p in fit.parameters] == pytest.approx([0.08, 0.05], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--design", "2"], "a motion of 2 s is not possible: between 5 and 120 s"),
+        (["--design", "nan"], "a motion of nan s is not possible"),
+        (["bag", "--design", "20"], "and not both"),
+        ([], "name bags of the robot, or a motion to record with --design S"),
+        (["--design", "20", "-o", "missing/excite.csv"], "cannot write 'missing/excite.csv'"),
+        (["--design", "20", "--gravity", "nan", "0", "0"], "is not finite"),
+        (["--design", "20", "--gravity", "0", "-999", "0"], "does not hold the robot in the middle of its range"),
+    ],
+)  # fmt: skip
+def test_a_design_that_is_not_possible_is_refused_in_a_line(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(excitation, "GENERATIONS", 1)
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", str(ARM), *words, "--free", "payload"]) in (1, 2)
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and not [*tmp_path.iterdir()]

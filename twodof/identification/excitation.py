@@ -1,0 +1,257 @@
+"""Design of an experiment: a motion within a robot's limits that tells most about free parameters.
+
+Each joint follows a Fourier series, and begins and ends at rest in the middle of its range, without acceleration:
+
+    v(t) = Σ a_k cos(kωt) + b_k sin(kωt),  ω = 2π/T,  Σ a_k = 0,  Σ k b_k = 0
+
+The coefficients minimise the determinant of the covariance of the parameters (a D-optimal design).
+
+Source: Swevers, Ganseman, Tükel, De Schutter, Van Brussel, "Optimal robot excitation and identification",
+IEEE Transactions on Robotics and Automation 13(5), 1997.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import differential_evolution
+
+from ..errors import InputError
+from ..export.urdf_source import read_text
+from ..files import refusing, write_file
+from ..plant.robot import Robot
+from ..plant.urdf import UNBOUNDED
+from .curves import efforts
+from .estimate import DELAY_SCALE, FIRST_NOISE, PRIOR, information_root, typical
+from .fitting import GRAVITY, check_gravity, read_robot
+from .parameters import Parameters
+from .regression import Rows, position_derivatives, regressors
+from .stretches import Array, Stretch
+
+SHORTEST, LONGEST = 5.0, 120.0  # s
+HARMONICS, HIGHEST = 6, 1.0
+"""Number of harmonics of a joint, and the highest frequency, Hz."""
+MARGIN = 0.9
+"""Part of the limits that the motion uses, because efforts are those of the URDF's masses."""
+REACH, SPEED = np.pi, 2.0
+"""Range to both sides, rad or m, and speed, rad/s or m/s, of joints that have no limits in the URDF."""
+COARSE, FINE = 0.1, 0.002
+"""Time between samples of the design and of the result, s."""
+CANDIDATES, GENERATIONS, BOUND = 30, 60, 6.0
+"""Number of random motions from which the search begins, its steps, and the bound of its coefficients."""
+HALVINGS = 8
+"""Bisections of the size of a motion to the effort limits."""
+
+
+class Excitation(NamedTuple):
+    """A motion to record for a fit.
+
+    Attributes:
+        joints: names of the robot's n joints.
+        t: time, s, N.
+        q, v, a: positions, rad or m, and their derivatives, N × n.
+        names: names of the free parameters.
+        ratios: ratio of each parameter's interval to that of a random motion within the same limits.
+        factor: how many times narrower the intervals are, the geometric mean over all directions of the parameters.
+    """
+
+    joints: tuple[str, ...]
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    names: tuple[str, ...]
+    ratios: Array
+    factor: float
+
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """Cells of the table: name, and interval relative to that of a random motion."""
+        head = ("parameter", "interval, of a random motion's")
+        return [head, *((name, f"{100.0 * ratio:.3g} %") for name, ratio in zip(self.names, self.ratios))]
+
+    @property
+    def remarks(self) -> list[str]:
+        """Gain over random motions, and a warning."""
+        return [
+            f"intervals of a fit are {self.factor:.3g} times narrower than with random motions within the same limits",
+            "collisions are not checked: look at the motion in a simulation before a robot follows it",
+        ]
+
+    def save(self, path: str | Path) -> Path:
+        """Write the motion as a CSV file of inputs for joint control; return its path.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        heads = [f"{group}[{i + 1}]" for group in ("q_des", "v_des", "a_des") for i in range(len(self.joints))]
+        rows = np.column_stack([self.t, self.q, self.v, self.a]).round(9).tolist()
+        lines = [",".join(["time", *heads]), *(",".join(map(repr, row)) for row in rows)]
+        with refusing(InputError, f"write '{path}'"):
+            write_file(Path(path), ("\n".join(lines) + "\n").encode())
+        return Path(path)
+
+
+class _Design:
+    """Motions of a robot within its limits, and what a fit can tell from them.
+
+    Args:
+        robot: the robot.
+        speed: speed limits of its joints, rad/s or m/s; infinite without one.
+        parameters: the free parameters.
+        seconds: duration, s.
+
+    Attributes:
+        shape: shape of the coefficients a and b: n × 2 × harmonics.
+        relative: size of coefficients that give all harmonics the same amplitude of the position.
+    """
+
+    def __init__(self, robot: Robot, speed: Sequence[float], parameters: Parameters, seconds: float) -> None:
+        self._robot, self._parameters, self._seconds = robot, parameters, seconds
+        self._values = parameters.dynamics(parameters.given)
+        self._harmonics = np.unique(np.geomspace(1.0, seconds * HIGHEST, HARMONICS).round())
+        self.shape, self.relative = (len(robot.joints), 2, len(self._harmonics)), self._harmonics / self._harmonics[-1]
+        low, high = np.array(robot.q_min), np.array(robot.q_max)
+        limited = (low > -UNBOUNDED) & (high < UNBOUNDED)
+        self._middle = np.where(limited, 0.5 * (low + high), 0.0)
+        self._reach = MARGIN * np.where(limited, 0.5 * high - 0.5 * low, REACH)
+        self._speed = MARGIN * np.where(np.isfinite(speed), speed, SPEED)
+        self._effort = MARGIN * np.array(robot.effort)
+        still = self._sampled(np.zeros(self.shape), COARSE)
+        for joint, effort, most in zip(robot.joints, np.abs(still.tau[0]), self._effort):
+            if effort >= most:
+                raise InputError(
+                    f"the effort limit of joint '{joint}' does not hold the robot in the middle of its range:"
+                    f" {effort:.3g} of {most:.3g} N·m; correct the limit or the masses in the URDF"
+                )
+
+    def refer(self, stretch: Stretch) -> None:
+        """Take scales of the parameters and noise of the efforts from a motion."""
+        scales = self._parameters.coordinates(typical([stretch]))
+        self._z, self._scales = np.append(scales[0], 0.0), np.append(scales[2], DELAY_SCALE)
+        self._noise = FIRST_NOISE * np.sqrt(np.mean(stretch.tau**2, axis=0))
+
+    def motion(self, coefficients: Array, step: float) -> Stretch:
+        """Return the motion, scaled to the largest one within the limits, in samples of a step, s."""
+        shape = coefficients.reshape(self.shape).copy()
+        _, q, v, _ = self._moved(shape, COARSE / 4.0)
+        off = np.abs(q - self._middle).max(axis=0) / self._reach
+        shape /= np.maximum(off, np.abs(v).max(axis=0) / self._speed)[:, None, None]
+        low, high = 0.0, 2.0
+        for _ in range(HALVINGS):
+            part = 0.5 * (low + high)
+            if (np.abs(self._sampled(part * shape, COARSE).tau) <= self._effort).all():
+                low = part
+            else:
+                high = part
+            if low == 1.0:
+                break
+        return self._sampled(low * shape, step)
+
+    def _sampled(self, shape: Array, step: float) -> Stretch:
+        t, q, v, a = self._moved(shape, step)
+        moving, band = np.ones(q.shape, bool), np.full(len(shape), 0.5 / step)
+        stretch = Stretch(0, t, q, q, v, a, np.zeros_like(q), moving, band)
+        return stretch._replace(tau=efforts(self._robot, self._values, stretch))
+
+    def _moved(self, shape: Array, step: float) -> tuple[Any, Any, Any, Any]:
+        """Return times, positions and their derivatives."""
+        t, k = step * np.arange(round(self._seconds / step) + 1), self._harmonics
+        w = 2.0 * np.pi * k / self._seconds
+        a = shape[:, 0] - shape[:, 0].mean(axis=1, keepdims=True)
+        b = shape[:, 1] - np.outer(shape[:, 1] @ k, k / (k @ k))
+        cos, sin = np.cos(np.outer(t, w)), np.sin(np.outer(t, w))
+        q = self._middle + (sin / w) @ a.T + ((1.0 - cos) / w) @ b.T
+        return t, q, cos @ a.T + sin @ b.T, (cos * w) @ b.T - (sin * w) @ a.T
+
+    def _covariance(self, stretch: Stretch) -> Array:
+        """Return the covariance of the coordinates, in their scales."""
+        Y, G = regressors(self._robot, stretch, self._values.offset)
+        offsets = any(free.group == "offset" for free in self._parameters.free)
+        turning = position_derivatives(self._robot, self._values, stretch, offsets)
+        rate, none = np.gradient(stretch.tau, stretch.step, axis=0), np.zeros(len(Y), np.int64)
+        signals = np.stack([np.sign(stretch.v), stretch.v, stretch.a, stretch.tau, rate])
+        about = self._values.offset, 0.0
+        rows = []
+        for i, (sign, v, a, tau, tau_rate) in enumerate(signals.transpose(2, 0, 1)):
+            gravity = G[:, :, i].swapaxes(0, 1)
+            rows.append(Rows(i, Y[:, i], gravity, sign, v, a, tau, tau_rate, turning[:, i], none, none, about))
+        sd = [np.full(len(Y), noise) for noise in self._noise]
+        J = information_root(self._parameters, rows, sd, self._z) * self._scales
+        return np.asarray(np.linalg.inv(J.T @ J + PRIOR**-2 * np.eye(len(self._z)))[:-1, :-1])
+
+    def deviations(self, motion: Stretch) -> Array:
+        """Return the standard deviations of the reported parameters after a fit to a motion."""
+        rates = self._parameters.rates(self._z[:-1])[0] * self._scales[:-1]
+        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", rates, self._covariance(motion), rates)))
+
+    def cost(self, coefficients: Array) -> float:
+        """Return the mean logarithm of the standard deviations in all directions."""
+        covariance = self._covariance(self.motion(coefficients, COARSE))
+        return float(0.5 * np.linalg.slogdet(covariance)[1] / len(covariance))
+
+
+def excite(
+    urdf: str | Path,
+    seconds: float,
+    free: str | Sequence[str],
+    *,
+    output: str | Path | None = None,
+    frame: str | None = None,
+    lock: Mapping[str, float] | None = None,
+    gravity: Sequence[float] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Excitation:
+    """Return a motion whose recording tells most about free parameters, within the limits of the URDF.
+
+    Collisions are not considered. The design is the same on each call.
+
+    Args:
+        urdf: the URDF or xacro file.
+        seconds: duration, s.
+        free: names or shell patterns of the free parameters, as for ``fit``.
+        output: CSV file of the motion; None: nothing is written.
+        frame: link of the payload; None: "EndEffector", or the only last link.
+        lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
+        gravity: m/s² in the root frame; None: (0, 0, −9.81).
+        progress: called with the numbers of finished and of all steps.
+
+    Raises:
+        InputError: the duration is out of range, a pattern matches no parameter, or an effort limit is too small to
+            hold the robot.
+        BuildError: the URDF cannot be read.
+    """
+    check_gravity(gravity)
+    if not SHORTEST <= seconds <= LONGEST:
+        raise InputError(f"a motion of {seconds:g} s is not possible: between {SHORTEST:g} and {LONGEST:g} s")
+    path, patterns = Path(urdf), [free] if isinstance(free, str) else free
+    _, locked, robot = read_robot(path.name, read_text(path, None), frame, lock or {}, patterns)
+    parameters = Parameters(locked, robot, patterns, gravity or GRAVITY)
+    known = locked.joints.values()
+    own = [[j.velocity / abs(j.ratio) for j in known if j.ratio and j.leader == name] for name in robot.joints]
+    design = _Design(robot, [min(each) for each in own], parameters, seconds)
+    rng = np.random.default_rng(0)
+    candidates = (rng.normal(size=(CANDIDATES, *design.shape)) * design.relative).reshape(CANDIDATES, -1)
+    design.refer(design.motion(candidates[0], COARSE))
+    costs = np.array([design.cost(each) for each in candidates])
+    steps = count(1)
+
+    def finished(intermediate_result: object) -> None:
+        if progress:
+            progress(next(steps), GENERATIONS)
+
+    best = differential_evolution(
+        design.cost, [(-BOUND, BOUND)] * candidates.shape[1], init=candidates, maxiter=GENERATIONS, tol=0.0,
+        mutation=(0.3, 0.7), recombination=0.5, polish=False, rng=rng, callback=finished,
+    )  # fmt: skip
+    median = candidates[np.argsort(costs)[CANDIDATES // 2]]
+    sd, other = (design.deviations(design.motion(each, COARSE)) for each in (best.x, median))
+    motion, factor = design.motion(best.x, FINE), float(np.exp(np.median(costs) - best.fun))
+    result = Excitation(robot.joints, motion.t, motion.q, motion.v, motion.a, parameters.names, sd / other, factor)
+    if output is not None:
+        result.save(output)
+    return result
