@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, count
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ..export.urdf_source import end_effector, last_links, lock_joints, read_tex
 from ..files import shown
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, Urdf, read_urdf
+from .commanded import commanded_efforts
 from .curves import Comparison, compare
 from .estimate import PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
@@ -116,10 +118,13 @@ def read_robot(
 
 
 def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
-    """Return the recordings of bags; raise InputError if there are none, or one counts twice."""
+    """Return the recordings of bags, with efforts; raise InputError if there are none, or one counts twice."""
     recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
     if not recordings:
         raise InputError("a fit needs a bag")
+    recordings = [
+        each if each.tau.shape == each.q.shape else replace(each, tau=commanded_efforts(each)) for each in recordings
+    ]
     for a, b in combinations(recordings, 2):
         if np.array_equal(a.t, b.t) and np.array_equal(a.q, b.q):
             raise InputError(f"'{b.path}' has the motion of '{a.path}', which would count twice; leave one out")

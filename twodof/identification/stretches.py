@@ -140,8 +140,6 @@ def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
                 " if it does not move"
             )
     order = [own.index(joint) for joint in robot.joints]
-    if recording.tau.shape != recording.q.shape:
-        raise InputError(f"'{name}' has no efforts: a fit needs the effort of each JointState")
     q, tau = recording.q[:, order], recording.tau[:, order]
     for values, what in ((q, "position"), (tau, "effort")):
         if bad := np.argwhere(~np.isfinite(values)).tolist():
