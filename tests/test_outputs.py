@@ -14,6 +14,7 @@ import pytest
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import BagError
 from twodof.files import write_file
 
 OLD, NEW = b"old", b"new" * 100_000
@@ -48,6 +49,27 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path):
     write_file(near, OLD)
     assert target.read_bytes() == OLD and near.is_symlink()
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["a", "b", "far", "file", "near"]
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root makes links of another user")
+@pytest.mark.parametrize("write", [lambda path: write_file(path, NEW), lambda path: twodof.Bag(path, overwrite=True)])
+@pytest.mark.parametrize(("mode", "owner"), [(0o1777, 2), (0o1777, 1), (0o1777, 0), (0o1755, 2), (0o777, 2)])
+def test_a_link_of_another_user_in_a_shared_folder_is_not_followed(mode, owner, write, tmp_path, monkeypatch):
+    """The rule, and what it permits, are those of Linux's fs.protected_symlinks; user 1 runs, root owns the folder."""
+    (folder := tmp_path / "shared").mkdir()
+    planted, near, target = folder / "planted", tmp_path / "near", tmp_path / "absent"
+    planted.symlink_to(target)
+    near.symlink_to(planted)
+    os.lchown(planted, owner, owner)
+    folder.chmod(mode)
+    monkeypatch.setattr(os, "geteuid", lambda: 1)
+    for path in (planted, near):
+        if (mode, owner) != (0o1777, 2):
+            write(path)
+            continue
+        with pytest.raises((PermissionError, BagError), match="link of another user in a shared folder"):
+            write(path)
+        assert not target.exists()
 
 
 def test_a_link_to_itself_is_no_file(tmp_path):

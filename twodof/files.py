@@ -163,14 +163,11 @@ def _within_directory(size: int | None) -> int | None:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file atomically, following links; or write into a device, pipe or /dev/stdout.
+    """Write a file atomically, following links; or write into a device, pipe or /dev/stdout; or raise OSError.
 
     The umask sets the mode of a new file; a replaced file keeps its mode.
-
-    Raises:
-        OSError: it cannot be written.
     """
-    descriptor, mode = descriptor_of(path), 0
+    descriptor, target, mode = descriptor_of(path), target_of(path), 0
     with suppress(FileNotFoundError):
         mode = os.stat(path).st_mode
     if descriptor is not None or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):
@@ -179,8 +176,6 @@ def write_file(path: Path, content: bytes) -> None:
         return
     if mode:
         check_file(path, sys.maxsize)
-    target = Path(os.path.realpath(path))
-    os.stat(f"{target.parent}/")  # otherwise the error would name the temporary file
     partial = target.with_name(f".twodof-{secrets.token_hex(8)}")
     new = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:
@@ -196,15 +191,29 @@ def write_file(path: Path, content: bytes) -> None:
 
 def descriptor_of(path: str | Path) -> int | None:
     """Return the descriptor of a name such as /dev/stdout or /dev/fd/3; None for other paths."""
+    names = [it.name for it in _names(path) if it.parent == Path(f"/proc/{os.getpid()}/fd")]
+    return next((int(name) for name in names if name.isdecimal()), None)
+
+
+def target_of(path: str | Path) -> Path:
+    """Return the path of an output, through links as far as Linux's rule fs.protected_symlinks follows them.
+
+    In a sticky folder for all users, such as /tmp, another user's link could name any file of this user: refused.
+    """
+    for name in _names(path):
+        folder, owner = name.parent.stat(), name.lstat().st_uid if name.is_symlink() else os.geteuid()
+        if folder.st_mode & 0o1002 == 0o1002 and owner not in (os.geteuid(), folder.st_uid):
+            raise PermissionError(errno.EACCES, f"'{name}' is a link of another user in a shared folder")
+    return Path(os.path.realpath(path))
+
+
+def _names(path: str | Path) -> Iterator[Path]:
+    """Yield a path, and what it names as a link, each with the real path of its folder."""
     for _ in range(MAX_LINKS_FOLLOWED):
-        folder, name = os.path.split(os.path.abspath(path))
-        if name.isdecimal() and os.path.realpath(folder) == f"/proc/{os.getpid()}/fd":
-            return int(name)
-        try:
-            path = Path(folder, os.readlink(path))
-        except OSError:  # it is no link
-            break
-    return None
+        yield (path := Path(os.path.realpath(Path(path).parent), Path(path).name))
+        if not path.is_symlink():
+            return
+        path = path.parent / os.readlink(path)
 
 
 @contextmanager

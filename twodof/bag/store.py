@@ -16,7 +16,7 @@ from rosbags.rosbag2 import WriterError
 
 from ..bounds import MAX_METADATA
 from ..errors import BagError
-from ..files import lock, read_file, sync
+from ..files import lock, read_file, refusing, sync, target_of
 from ..ros.messages import Topic, store_of
 from .provenance import read_provenance, robots_of
 from .storage import REMOVED, STORAGES, BagWriter, check_path
@@ -58,7 +58,9 @@ class Store:
             raise BagError(f"`compress` '{compress}' is unknown; there is: zstd")
         if compress and storage != "mcap":
             raise BagError(f"`compress` applies to storage mcap only, not to {storage}")
-        path = Path(os.path.realpath(path)) if os.path.islink(path) else path  # the link stays
+        if os.path.islink(path):  # the link stays
+            with refusing(BagError, f"write '{path}'"):
+                path = target_of(path)
         check_path(path, storage)
         self.path, self.fsync = path, fsync
         self._storage, self._overwrite, self._compress = storage, overwrite, compress
