@@ -5,12 +5,14 @@ import os
 import socket
 import sys
 import urllib.request
+from contextlib import ExitStack
 
 import browser
 import pytest
+from websockets.sync.client import connect
 
 from twodof.errors import PageError
-from twodof.pages.serving import Server
+from twodof.pages.serving import LARGEST, MOST_CONNECTIONS, Server
 
 
 def names_of(*names: str) -> list[str]:
@@ -110,6 +112,28 @@ def test_what_a_page_is_not_asked_for_is_answered(method):
         asking.request(method, "/")
         answer = asking.getresponse()
         assert (answer.status, answer.getheader("Allow"), answer.read()) == (405, "GET", b"")
+
+
+def test_connections_without_a_request_are_bounded() -> None:
+    """Idle ones neither use up the descriptors nor keep others from the page; websockets stay open."""
+    page = Server(b"page", port=0, talk=lambda connection: connection.wait_closed(), token="t")
+    with page, connect(page.url.replace("http:", "ws:").replace("?", "socket?")) as held, ExitStack() as idle:
+        before = len(os.listdir("/proc/self/fd"))
+        for _ in range(5 * MOST_CONNECTIONS):
+            idle.enter_context(browser.connected(page.url, "127.0.0.1"))
+        with urllib.request.urlopen(page.url, timeout=10) as answer:
+            assert answer.read() == b"page"
+        assert len(os.listdir("/proc/self/fd")) - before < 6 * MOST_CONNECTIONS + 10
+        held.ping().wait(10)
+
+
+@pytest.mark.parametrize("begin", [b"GET / HTTP/1.1\r\n", b"GET /" + b"a" * LARGEST])
+def test_a_request_without_end_is_cut_off(begin: bytes) -> None:
+    with Server(b"page", port=0) as page, browser.connected(page.url, "127.0.0.1") as one:
+        one.sendall(begin)
+        with pytest.raises(ConnectionError):
+            for _ in range(100):
+                one.sendall(b"X: " + b"a" * 1_000_000 + b"\r\n")
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])

@@ -1,13 +1,16 @@
 """Serve a run to Foxglove without ROS: the bag's messages over a WebSocket, and gains as parameters.
 
-Foxglove's SDK answers any website. Therefore it listens on a random address of the loopback network, and a relay of
-``serving``, which checks the origin of requests, answers browsers.
+Foxglove's SDK answers any website and user. Therefore it listens on a random address of the loopback network, where
+the kernel drops all segments without the signature of this process. A relay of ``serving``, which checks the origin
+and the user of requests, answers Foxglove.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import secrets
+import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from threading import Lock
@@ -23,7 +26,7 @@ from ..simulation.input_values import Value, check_going_on, resolve
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
 from ..version import needing
-from .serving import HOST, Server, relay
+from .serving import HOST, Connection, Server, lock_port, relay
 
 with needing(PublishError, "serve Foxglove", "foxglove"):
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -86,7 +89,9 @@ class Foxglove(Sink):
             schema = Schema(name=topic.type, encoding="ros2msg", data=definition(topic.type).encode())
             self._channels[name] = Channel(name, schema=schema, message_encoding="cdr", context=context)
         hidden = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
+        private, key = self._set_gains, secrets.token_bytes(32)
         try:
+            self._door = Server(None, HOST, self._port, self._talk, origins=APPS, protocol=PROTOCOL, private=private)
             self._server = start_server(
                 name="twodof",
                 host=hidden,
@@ -95,9 +100,14 @@ class Foxglove(Sink):
                 capabilities=[Capability.Parameters],
                 server_listener=self._gains,
             )
-            talk = partial(relay, f"ws://{hidden}:{self._server.port}")
-            private = self._set_gains
-            self._door = Server(None, HOST, self._port, talk, origins=APPS, protocol=PROTOCOL, private=private)
+            address = hidden, self._server.port
+            locked = lock_port(address, key)
+            if private and sys.platform == "linux" and os.geteuid() and not locked:
+                self._server.stop()
+                raise OSError(
+                    "this kernel has no TCP_MD5SIG, so other users could set gains: leave out `set_gains=True`"
+                )
+            self._relay = partial(relay, address, key if locked else b"")
         except (RuntimeError, OSError, PageError) as error:
             raise PublishError(f"cannot serve Foxglove: {error}") from error
         self._door.__enter__()
@@ -121,6 +131,9 @@ class Foxglove(Sink):
     def command(self, stop: Callable[[], bool] = never, pace: RealTime | None = None) -> dict[str, Value]:
         """Return the gains that were set since the last call, as inputs of the FMU."""
         return self._gains.take()
+
+    async def _talk(self, connection: Connection) -> None:
+        await self._relay(connection)
 
     def __exit__(self, *exception: object) -> None:
         self._door.__exit__(*exception)

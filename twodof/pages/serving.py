@@ -14,12 +14,13 @@ import secrets
 import socket
 import stat
 import struct
+import sys
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from itertools import permutations
+from itertools import count, permutations
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -33,12 +34,16 @@ with needing(PageError, "show a page", "view"):
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
+    from websockets.protocol import State
     from websockets.typing import Subprotocol
 
 HOST, PORT = "127.0.0.1", 8080
 SLOW = 60.0  # s for the transfer of a page to a browser
 CLOSING = 1.0  # s
-LARGEST = 64 * 1024  # bytes of a message from a browser
+LARGEST = 64 * 1024  # bytes of a message from a browser, or of its requests before a websocket is open
+MOST_CONNECTIONS = 64
+BURST, PAUSE = 20, 0.1  # messages that a relay takes from a client between two pauses, and a pause, s
+TCP_MD5SIG_EXT = 32  # on Linux, from kernel 4.13
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 REFUSED = "open this page at the printed address; the argument host gives it another address or name\n"
 OTHER_USER = "only programs of the user who runs twodof are answered\n"
@@ -159,10 +164,21 @@ class _Answering(ServerConnection):
     """A connection that answers requests which the websockets library would drop."""
 
     _asked = False
+    _size = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Open a connection; if there are too many, end the oldest one that is not yet an open websocket."""
+        super().connection_made(transport)
+        present = [it for it in self.server.handlers if not it.transport.is_closing()]
+        if len(present) > MOST_CONNECTIONS:
+            next(it for it in present if it.state is State.CONNECTING).transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Receive data, which begins with a request."""
-        if self._asked or b"GET ".startswith(data[:4]):
+        """Receive data, which begins with a request of limited size."""
+        self._size += len(data) if self.state is not State.OPEN else 0
+        if self._size > LARGEST:
+            self.transport.abort()
+        elif self._asked or b"GET ".startswith(data[:4]):
             self._asked = True
             super().data_received(data)
         else:
@@ -186,17 +202,57 @@ def user_token() -> str:
     return secrets.token_urlsafe(32)
 
 
-async def relay(url: str, connection: Connection) -> None:
-    """Pass messages between a websocket and that of another server, until one of them closes."""
+def lock_port(address: tuple[str, int], key: bytes) -> bool:
+    """Let only ``relay`` with this key connect to a port on which this process listens; return whether it is so.
+
+    Linux then drops all TCP segments without the signature of RFC 2385, also of accepted connections.
+    """
+    signed = []
+    for number in map(int, os.listdir("/proc/self/fd") * 2 if sys.platform == "linux" else ()):  # the listener first
+        with suppress(OSError):  # closed meanwhile
+            if stat.S_ISSOCK(os.fstat(number).st_mode):
+                with socket.socket(fileno=os.dup(number)) as one:
+                    if one.family == socket.AF_INET and one.getsockname() == address:
+                        signed.append(_sign(one, key))
+    return all(signed) and bool(signed)
+
+
+def _sign(one: socket.socket, key: bytes) -> bool:
+    """Make a socket sign its segments and drop unsigned ones; return False if it cannot. Source: linux/tcp.h."""
+    any_address = struct.pack("=H126x", socket.AF_INET)
+    try:
+        one.setsockopt(
+            socket.IPPROTO_TCP, TCP_MD5SIG_EXT, any_address + struct.pack("=BBHi80s", 1, 0, len(key), 0, key)
+        )
+    except OSError:
+        return False
+    return True
+
+
+async def relay(address: tuple[str, int], key: bytes, connection: Connection) -> None:
+    """Pass messages between a websocket and a server of this process, until one of them closes.
+
+    Args:
+        address: address of the server.
+        key: key with which ``lock_port`` has locked it; b"": not locked.
+        connection: the websocket.
+    """
     protocols = [connection.subprotocol] if connection.subprotocol else None
+    inner = socket.socket()
+    if key:
+        _sign(inner, key)
+    inner.connect(address)  # of this process: it does not wait
+    url, taken = f"ws://{address[0]}:{address[1]}", count(1)
     async with connect(
-        url, subprotocols=protocols, compression=None, max_size=None, proxy=None, logger=_silent
+        url, sock=inner, subprotocols=protocols, compression=None, max_size=None, proxy=None, logger=_silent
     ) as other:
 
         async def pump(source: Any, sink: Any) -> None:
             with suppress(ConnectionClosed):
                 async for message in source:
                     await sink.send(message)
+                    if sink is other and next(taken) % BURST == 0:  # a flood would delay the run
+                        await asyncio.sleep(PAUSE)
 
         pumps = [asyncio.ensure_future(pump(*ends)) for ends in permutations((connection, other))]
         await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
