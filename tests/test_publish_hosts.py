@@ -9,8 +9,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
 from harness import wait_until
 from nodes import CABLE, Node, ended, isolated, published
+
+import twodof
+from twodof.ros.dds import dds_qos, dds_topic
+from twodof.ros.listener import Commanders
+from twodof.ros.messages import POINT, STREAM
+from twodof.ros.network import Network, open_domain
 
 FOREIGN = """
 import sys, time
@@ -146,3 +155,24 @@ def test_a_host_whose_own_name_nothing_resolves() -> None:
     assert subprocess.run([*nameless, "getent", "hosts", "localhost"], check=False).returncode == 2
     done = subprocess.run([*nameless, sys.executable, "-c", opens], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "lo"), done.stderr
+
+
+def test_a_node_that_leaves_at_once_is_recorded(native_path, number):
+    """Before its command is read, DDS has forgotten its writer."""
+    run, _shared = twodof.experiment(native_path), open_domain(Network(number))
+    own, quality = DomainParticipant(number), dds_qos(STREAM, POINT)
+    reader, commanders = DataReader(own, dds_topic(own, "/target_command", POINT), quality), Commanders(own, run)
+
+    def command() -> str:
+        node = DomainParticipant(number)
+        writer = DataWriter(node, dds_topic(node, "/target_command", POINT), quality)
+        wait_until(lambda: bool(reader.get_matched_publications() and writer.get_matched_subscriptions()))
+        writer.write(writer.data_type(b"\0\1\0\0" + bytes(8) + b"\1" + bytes(31)))
+        return str(node.guid)
+
+    guid = command()
+    wait_until(lambda: not reader.get_matched_publications())
+    (message,) = (one for one in reader.take(10) if one.sample_info.valid_data)
+    commanders.note(message.sample_info.publication_handle, 1.0)
+    ((t, facts),) = run.commanders
+    assert (t, facts["guid"]) == (1.0, guid) and {*facts} == {"guid", "host", "process"}

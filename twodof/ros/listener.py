@@ -23,6 +23,7 @@ UNREAD = core.SampleState.NotRead | core.ViewState.Any | core.InstanceState.Any
 WHAT = {JOINT_STATE: "a command", POINT: "a point", POSE: "a pose"}
 Read = TypeVar("Read")
 MOST_COMMANDERS = 20  # recorded nodes
+MOST_READ = 10_000  # nodes or writers of the network, past ones included
 AT_ONCE = 1.0  # s within which commands of two nodes conflict
 PROPERTIES = {
     "host": ("__Hostname", "fastdds.physical_data.host"),
@@ -40,29 +41,32 @@ class Commanders:
     """
 
     def __init__(self, participant: domain.DomainParticipant, run: Experiment) -> None:
-        topic = builtin.BuiltinTopicDcpsParticipant
-        self._participants, self._run = builtin.BuiltinDataReader(participant, topic), run
-        self._names: dict[int, str] = {}
+        # readers that keep what they have received, because a node may leave before its command is read
+        self._participants = builtin.BuiltinDataReader(participant, builtin.BuiltinTopicDcpsParticipant)
+        self._writers = builtin.BuiltinDataReader(participant, builtin.BuiltinTopicDcpsPublication)
+        self._run, self._names = run, dict[int, str]()
         self._latest, self._since = "", 0.0
         self._warn = warner(LOG)
 
-    def note(self, reader: sub.DataReader, writer: int, t: float) -> None:
+    def note(self, writer: int, t: float) -> None:
         """Register the writer of a command, by its handle, at a time of the run, s."""
         if writer not in self._names:
-            self._names[writer] = self._record(reader, writer, t)
+            self._names[writer] = self._record(writer, t)
         name, now = self._names[writer], time.monotonic()
         if self._latest not in ("", name) and now - self._since < AT_ONCE:
             both = f"{self._latest} and {name}"
             self._warn("two", f"two nodes command the robot at once, {both}: the newest wins")
         self._latest, self._since = name, now
 
-    def _record(self, reader: sub.DataReader, writer: int, t: float) -> str:
+    def _record(self, writer: int, t: float) -> str:
         """Return the GUID of a writer's participant, and record its host and process."""
-        endpoint = reader.get_matched_publication_data(writer)
-        if endpoint is None:  # the writer has left
+        endpoint = next(
+            (one for one in self._writers.read(MOST_READ) if one.sample_info.instance_handle == writer), None
+        )
+        if endpoint is None:
             return f"writer {writer:x}"
         facts = {"guid": str(endpoint.participant_key)}
-        for one in self._participants.read(1000):
+        for one in self._participants.read(MOST_READ):
             if one.key == endpoint.participant_key and one.qos is not None:
                 properties = {p.key: p.value for p in one.qos if isinstance(p, core.Policy.Property)}
                 names = ((fact, key) for fact, keys in PROPERTIES.items() for key in keys)
@@ -128,7 +132,7 @@ class Listener:
                 return command
 
             for command, writer in self._come(name, read, WHAT[kind]):
-                self._commanders.note(self._readers[name], writer, sample.t)
+                self._commanders.note(writer, sample.t)
                 if command.unknown_joints:
                     reason = f"a command on {name} names joints that this robot does not have"
                     names = ", ".join(command.unknown_joints)[:LONGEST_NAME]
