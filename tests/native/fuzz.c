@@ -132,7 +132,7 @@ static Status exchange(Instance *c)
     case 1: return derivatives(c);
     case 2:
         status = STANDARD(EnterEventMode)(c);
-        CHECK((status == OK) == runs && c->state.phase == (runs ? EVENT : phase));
+        CHECK((status == OK) == (runs || (FMI == 2 && event)) && c->state.phase == (runs ? EVENT : phase));
         return status;
     case 3:
     case 4:
