@@ -181,6 +181,12 @@ def test_a_description_with_problems_fails(tmp_path: Path) -> None:
     assert {*outcomes.values()} == {("does not apply", "it was not run, because its description cannot be read")}
 
 
+def test_a_step_that_is_too_small_is_not_run(tmp_path: Path) -> None:
+    check = twodof.check(foreign(tmp_path, description=DESCRIPTION.replace('"0.01"', '"1e-300"')))
+    texts = {row.text for row in check.rows if row.name in TRIALS}
+    assert texts == {"its default step of 1e-300 s is below 1e-06 s, the smallest that is run"}
+
+
 NAMES = """a _a1 1a a.b a[1] a[1,2].b_2[3] a[] a. der(x) der(x[1]) der(x,2) der(x,) der(a.b[1],3) der(der(x)) 'a-b'
 'a''b' 'it\\'s' '\\n' '' 'ö' ö a-b 'a'.b['1'] x' 'a[1].der(x)'[2] der der( der() der(x).y ٣ a٣ a[٣]"""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from subprocess import DEVNULL
 from typing import NamedTuple
 
-from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_ROW
+from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_ROW, MIN_STEP
 from ..children import Child, limit
 from ..errors import FmuError, InputError
 from ..export.package import has_member
@@ -188,6 +188,9 @@ def _serve(pipe: Connection, path: Path, inside: str, tasks: Sequence[_Task], fo
 
     def result(task: _Task) -> str:
         if task.trial in TRIALS:
+            if not trial.step >= MIN_STEP:
+                reason = f"its default step of {trial.step:g} s is below {MIN_STEP:g} s, the smallest that is run"
+                raise UnpassedError("does not apply", reason)
             return TRIALS[task.trial](trial)
         if not references:
             references.update({reference.name: reference for reference in references_of(trial.fmu)})
