@@ -41,17 +41,11 @@ static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
 }
 
 /* Begin a hold at t, longer than the last one if that ended less than `soon` ago. */
-static void hold_for_a_while(Hold *hold, double t, double soon, double longest)
+static void hold_for_a_while(Hold *hold, double t, double soon, double longest, double first)
 {
     const int again = t - hold->until < soon;
-    hold->length = again ? fmin(HOLD_GROWTH * hold->length, longest) : FIRST_HOLD * longest;
+    hold->length = again ? fmin(HOLD_GROWTH * hold->length, longest) : first * longest;
     hold->until = t + hold->length;
-}
-
-/* Hold a joint that friction holds again. */
-static void hold_stuck(AntiChatter *chatter, int i, double t)
-{
-    hold_for_a_while(&chatter->stuck[i], t, SHORT_CHATTER_TIME * chatter->chatter_time, chatter->chatter_time);
 }
 
 /* The longest hold within the tolerance of a joint, if a hold of the length `passed` has the given error. The error
@@ -78,7 +72,7 @@ static double hold_joints(AntiChatter *chatter, const Step *step, double t, doub
     for (int i = 0; i < N_JOINTS; i++)
         any |= chatter->chattering[i];
     if (any)
-        hold_for_a_while(&chatter->joints, t, chatter->soon, chatter->longest);
+        hold_for_a_while(&chatter->joints, t, chatter->soon, chatter->longest, chatter->rigid ? SHORT_CHATTER_TIME : FIRST_HOLD);
     const int all = any && chatter->joints.length >= HOLD_OF_ALL * chatter->chatter_time;
     for (int i = 0; i < N_JOINTS && (any || !(chatter->joints.until > t)); i++)
         chatter->joints_held[i] = all ? is_at_limit(step, i) : chatter->chattering[i];
@@ -91,24 +85,18 @@ static double hold_joints(AntiChatter *chatter, const Step *step, double t, doub
     return end;
 }
 
-/* Record which joints leave limits or begin to slip at t. True if rounding holds a joint again that was released. */
-static int held_again(AntiChatter *chatter, const Step *step, const Event *event, double t)
+/* Record which joints leave limits or begin to slip at t. */
+static void find_departures(AntiChatter *chatter, const Step *step, double t)
 {
-    int any = 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        const int again = step->stops.watched[i] && event->released[i];
         if (!step->stops.held[i] && is_at_limit(step, i))
             chatter->left[i] = t;
         if (!step->stops.held[i] && step->stops.slip[i] && step->y[N_JOINTS + i] == 0.0)
             chatter->slipped[i] = t;
-        if (again && step->stops.held[i] == STUCK)
-            hold_stuck(chatter, i, t);
-        chatter->chattering[i] = again && step->stops.held[i] != STUCK;
-        any |= again;
+        chatter->chattering[i] = 0;
     }
     chatter->soon = chatter->rigid ? chatter->chatter_time : HOLD_GROWTH * chatter->joints.length;
     chatter->longest = chatter->chatter_time;
-    return any;
 }
 
 /* True if the rank drops at t so soon after a rise that it is held: the effect of the higher rank is within the
@@ -128,7 +116,7 @@ static int changes_back(AntiChatter *chatter, const Step *step, int before, doub
         longest = bounded(longest, step, i, error, passed);
     }
     if (passed < longest)
-        hold_for_a_while(&chatter->rank, t, longest, longest);
+        hold_for_a_while(&chatter->rank, t, longest, longest, FIRST_HOLD);
     return passed < longest;
 }
 
@@ -147,6 +135,7 @@ static void find_chatter(AntiChatter *chatter, const Step *step, const Event *ev
                 chatter->soon = fmax(chatter->soon, hold);
         }
         if (event->arrested[i] && t - chatter->slipped[i] < FIRST_HOLD * chatter->chatter_time)
-            hold_stuck(chatter, i, t);
+            hold_for_a_while(&chatter->stuck[i], t, SHORT_CHATTER_TIME * chatter->chatter_time,
+                             chatter->chatter_time, FIRST_HOLD);
     }
 }

@@ -18,6 +18,7 @@ typedef struct {
     const double (*P)[4];                  /* weights of K in the dense output */
     double K[STAGES + 1][N_STATES];
     double effort[STAGES + 1][N_JOINTS];   /* the efforts that hold joints at rest */
+    double rounding;                       /* bound on the rounding error of the holding efforts */
     long evaluations;                      /* evaluations of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */
     double margin, margin_new;             /* margins of the rank at y and y_new */

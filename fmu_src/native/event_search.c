@@ -26,6 +26,8 @@ static const double DOUBT = 0.25;
 /* Halvings of a step in the search; shorter excursions are ignored. */
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
+/* The same for a release, at which the acceleration is 0, so that the error of the state grows with its square. */
+static const double RELEASE_RESOLUTION = 1.0 / 67108864.0; /* 2⁻²⁶ */
 /* Fraction of the largest step. Joints that reach rigid stops within it of an event stop with that event. */
 static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
 
@@ -61,10 +63,10 @@ static void find_efforts(Step *step, double passed, double effort[N_JOINTS])
     evaluate(step, y, a, effort, NULL);
 }
 
-/* Distance of a joint's holding effort from its bound on one side. */
+/* Distance of a joint's holding effort from its bound on one side, beyond rounding: a released joint moves. */
 static double grip_of(const Step *step, int i, double effort, int side)
 {
-    return grip(step->plant, &step->stops, i, step->y[i], effort, side);
+    return grip(step->plant, &step->stops, i, step->y[i], effort, side) + step->rounding;
 }
 
 static double least_grip(const Step *step, const double effort[N_JOINTS])
@@ -109,7 +111,8 @@ static double singular_margin(Step *step, double passed, int rank_held)
 static double locate(Step *step, Margin *margin, int joint, double a, double at_a, double b,
                      double at_b)
 {
-    const double resolution = TIME_RESOLUTION * step->size, k = 0.2 / (b - a);
+    const double resolution = (margin == release_margin ? RELEASE_RESOLUTION : TIME_RESOLUTION) * step->size;
+    const double k = 0.2 / (b - a);
     double slack = b - a; /* how much longer the interval may be than after bisection */
     while (b - a > resolution) {
         const double middle = 0.5 * (a + b), half = 0.5 * (b - a);
@@ -228,7 +231,7 @@ static double first_release(Step *step, double before)
         return HUGE_VAL;
     const double instant = TIME_RESOLUTION * step->size;
     if (release_margin(step, instant, 0) < 0.0)
-        return instant; /* a release by rounding, which bisection would find in fifty steps */
+        return instant; /* a release by rounding */
     memcpy(effort[0], step->effort[0], sizeof *effort);
     memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
     for (int k = 1; k < LOOKS; k++)
@@ -292,17 +295,11 @@ static double sweep(const Step *step, int near[N_STATES])
 static void name_event(Step *step, double passed, const double y[N_STATES], Event *event)
 {
     const Stops *stops = &step->stops;
-    double a[N_JOINTS], effort[N_JOINTS] = {0};
-    if (stops->any_watched)
-        evaluate(step, y, a, effort, NULL);
     for (int i = 0; i < N_JOINTS; i++) {
         const double margin = limit_margin(step, passed, i), speed = y[N_JOINTS + i];
         const int into = is_above(step->plant, y[i], i) ? speed > 0.0 : speed < 0.0;
         event->stopped[i] = !stops->held[i] && (margin < 0.0 || (margin == 0.0 && into));
         event->arrested[i] = !stops->held[i] && stops->slip[i] * y[N_JOINTS + i] < 0.0;
-        event->released[i] =
-            stops->watched[i]
-            && fmin(grip_of(step, i, effort[i], -1), grip_of(step, i, effort[i], 1)) < 0.0;
     }
 }
 

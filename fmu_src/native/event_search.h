@@ -5,10 +5,9 @@
 #include "dormand_prince.h"
 #include "internal.h"
 
-/* The event at the end of a step: joints that reached a limit, joints that slipped and came to rest, and joints that
-   are released. */
+/* The event at the end of a step: joints that reached a limit, and joints that slipped and came to rest. */
 typedef struct {
-    int stopped[N_JOINTS], arrested[N_JOINTS], released[N_JOINTS];
+    int stopped[N_JOINTS], arrested[N_JOINTS];
 } Event;
 
 /* First time in (0, size] at which the regime of the step ends; y_new becomes the state there. 0 if it does not end.

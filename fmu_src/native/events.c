@@ -26,11 +26,11 @@ static const double BACK = 1e-13;
 static const double SLOW = 1e-4;
 
 /* Find the joints that rest at the plant's state, by the rules of stops.h. */
-static void find_stops(const Plant *plant, Stops *stops)
+static void find_stops(Plant *plant, Stops *stops)
 {
     const int anti_chatter[N_JOINTS] = {0};
     double a[N_JOINTS], effort[N_JOINTS];
-    find_regime(plant, &plant->value[Q], anti_chatter, ANY_RANK, stops, a, effort, NULL);
+    find_regime(plant, &plant->value[Q], anti_chatter, ANY_RANK, 0.0, stops, a, effort, NULL);
 }
 
 /* Distance to a position past a limit, increased if the joint moves away at v, so that a solver's error is no event; 1

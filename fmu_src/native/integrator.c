@@ -21,15 +21,19 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 static const double FINEST_TOLERANCE = 1.0 / 68719476736.0; /* 2⁻³⁶ */
 /* Step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s. */
 static const double NUDGE = 1e-6;
+/* Fraction of the largest step. Joints that an impact moves, and that come to rest within it, stop with the impact. */
+static const double WINDOW = 1.0 / 8192.0; /* 2⁻¹³ */
 
 /* Determine the regime at y, where joints may rest. */
 static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
 {
-    impact(step->plant, step->y, anti_chatter);
+    const double *value = step->plant->value;
+    const int hits = impact(step->plant, step->y, anti_chatter) && value[RIGID_STOPS] != 0.0;
     step->evaluations++;
-    find_regime(step->plant, step->y, kept, rank_held ? step->stops.rank : ANY_RANK, &step->stops,
-                step->K[0] + N_JOINTS, step->effort[0], &step->margin);
+    find_regime(step->plant, step->y, kept, rank_held ? step->stops.rank : ANY_RANK,
+                hits ? WINDOW * value[MAX_STEP] : 0.0, &step->stops, step->K[0] + N_JOINTS, step->effort[0], &step->margin);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
+    step->rounding = rounding_of(&step->stops, step->effort[0]);
 }
 
 /* True if inputs and all joints are held, so that nothing changes. */
@@ -135,7 +139,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
     if (IS_CONTROLLER)
         return 1;
     int kept[N_JOINTS], integrator = (int)plant->value[INTEGRATOR];
-    Event event = {{0}, {0}, {0}};
+    Event event;
     AntiChatter chatter;
     Step step;
     double t = 0.0;
@@ -151,10 +155,8 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
         const int before = step.stops.rank, rank_held = chatter.rank.until > t;
         const double end = hold_joints(&chatter, &step, t, h, kept);
         set_out(&step, chatter.joints_held, kept, rank_held);
-        const int again = held_again(&chatter, &step, &event, t);
+        find_departures(&chatter, &step, t);
         memset(&event, 0, sizeof event);
-        if (again)
-            continue;
         step.crossed |= t > 0.0 && step.stops.rank != before;
         if (changes_back(&chatter, &step, before, t))
             continue;

@@ -66,12 +66,12 @@ static int mended(const Contact *contact, double acts, double rate, double slack
 /* Solve a linear complementarity problem for rate + M⁻¹z, with z within the contacts' bounds: the result is above 0
    only if z is at its lower bound, and below 0 only if z is at its upper bound. Each iteration changes all violated
    contacts (block pivoting). If their number does not decrease for some iterations, only the last one changes, which
-   terminates for every positive definite M. Returns whether a solution was found.
+   terminates for every positive definite M. Returns whether a solution was found, with the rates and z.
    Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974. */
 static int complementary(const Plant *plant, const double q[N_JOINTS], Contact contact[N_JOINTS],
-                         double rate[N_JOINTS])
+                         double rate[N_JOINTS], double z[N_JOINTS])
 {
-    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0}, z[N_JOINTS];
+    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0};
     int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0, count = 1, finite = 1, bounded = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         const int resists = contact[i].there && contact[i].high > 0.0 && contact[i].low < 0.0;
@@ -109,20 +109,56 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
     return !bounded || (finite && (!any || count == 0));
 }
 
-void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
+int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
 {
     Contact contact[N_JOINTS];
-    double *v = y + N_JOINTS;
+    double impulse[N_JOINTS], *v = y + N_JOINTS;
     int any = 0;
     find_contacts(plant, y, anti_chatter, contact);
     for (int i = 0; i < N_JOINTS; i++)
         any |= is_pressed(&contact[i], v[i]);
-    if (any && plant->value[RIGID_STOPS] != 0.0 && !complementary(plant, y, contact, v))
+    if (any && plant->value[RIGID_STOPS] != 0.0 && !complementary(plant, y, contact, v, impulse))
         v[0] = NAN; /* which no step accepts */
     else if (plant->value[RIGID_STOPS] == 0.0)
         for (int i = 0; i < N_JOINTS; i++)
             if (is_pressed(&contact[i], v[i]))
                 v[i] = 0.0;
+    return any;
+}
+
+/* Stop the joints that move at y, with the accelerations a, until friction or a rigid stop ends their motion within a
+   window, s, which may be 0. Returns whether there are any. */
+static int stop_within(const Plant *plant, double window, double y[N_STATES], const double a[N_JOINTS],
+                       const int slip[N_JOINTS], const int kept[N_JOINTS])
+{
+    Contact contact[N_JOINTS];
+    double rate[N_JOINTS], free[N_JOINTS], given[N_JOINTS], change[N_JOINTS], impulse[N_JOINTS], *v = y + N_JOINTS;
+    int any = 0;
+    if (window == 0.0)
+        return 0;
+    find_contacts(plant, y, kept, contact);
+    for (int i = 0; i < N_JOINTS; i++) {
+        Contact *own = &contact[i];
+        const double friction = window * plant->value[FRICTION + i];
+        own->low = own->side < 0.0 ? -HUGE_VAL : friction * (slip[i] - 1); /* beyond the friction in a */
+        own->high = own->side > 0.0 ? HUGE_VAL : friction * (slip[i] + 1);
+        own->there |= friction > 0.0;
+        own->fixed &= v[i] == 0.0 || own->side != 0.0;
+        own->side = own->side == 0.0 ? slip[i] : own->side;
+        rate[i] = v[i] + window * a[i];
+        any |= own->there && rate[i] * v[i] < 0.0;
+    }
+    if (!any || !complementary(plant, y, contact, rate, impulse))
+        return 0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        free[i] = contact[i].there && rate[i] == 0.0 ? 0.0 : 1.0;
+        given[i] = free[i] == 0.0 ? -v[i] : 0.0;
+    }
+    hybrid_motion(plant, y, &plant->value[ARMATURE], free, given, change, impulse);
+    for (int i = 0; i < N_JOINTS; i++)
+        v[i] = free[i] == 0.0 ? 0.0 : v[i] + change[i];
+    impact(plant, y, kept);
+    return 1;
 }
 
 /* Add friction to the bounds of joints at rest; return whether any joint may rest. The friction of a clamp that holds
@@ -159,7 +195,7 @@ static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *
         a[i] += change[i];
 }
 
-void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_JOINTS], int rank,
+void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
                  Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
@@ -172,11 +208,15 @@ void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_
         stops->any_slip |= stops->slip[i] != 0;
     }
     stops->rank = acceleration(plant, y, v, slip_of(stops), rank, a, margin);
+    if (stop_within(plant, window, y, a, stops->slip, kept)) {
+        find_regime(plant, y, kept, rank, 0.0, stops, a, effort, margin);
+        return;
+    }
     find_contacts(plant, y, kept, contact);
     if (!add_friction(plant, v, contact))
         return;
     memcpy(stopped, a, sizeof stopped);
-    if (!complementary(plant, y, contact, stopped)) {
+    if (!complementary(plant, y, contact, stopped, effort)) {
         for (int i = 0; i < N_JOINTS; i++)
             a[i] = NAN; /* which no step accepts */
         return;
@@ -195,6 +235,10 @@ void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_
         stops->watched[i] = stops->held[i] && !own->fixed;
         stops->any_held |= stops->held[i] != FREE;
         stops->any_watched |= stops->watched[i];
+    }
+    if (rigid) { /* no clamps: the problem's solution has all */
+        memcpy(a, stopped, sizeof stopped);
+        return;
     }
     add_slip(plant, y, stops, a);
     restrain(plant, stops, y, a, effort);

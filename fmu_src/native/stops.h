@@ -21,13 +21,14 @@ typedef struct {
 #ifndef IS_COMPLEX
 /* Remove the velocity that points into a limit from the state y = (q, v). Joints in anti_chatter stop in both
    directions; without them, mutual impacts could repeat without end in finite time (Zeno), as those of the feet of a
-   rocking block. */
-INTERNAL void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS]);
+   rocking block. Returns whether a velocity pointed into a limit. */
+INTERNAL int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS]);
 
 /* Find the regime at y after an impact, with the given rank of J⁺. a receives q̈ in this regime, effort the result of
    restrain, margin that of acceleration. Resting joints in kept stay at rest even if the holding effort exceeds its
-   bounds. */
-INTERNAL void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_JOINTS], int rank,
+   bounds. Joints whose motion friction or a rigid stop ends within a window, s, stop at once: the window is that of an
+   impact, and otherwise 0. */
+INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
                           Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin);
 
 /* Distance of a joint's holding effort from its lower (side −1) or upper (side 1) bound; HUGE_VAL without a bound. A

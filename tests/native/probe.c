@@ -82,7 +82,7 @@ FMI2_Export void probe_stopped(double value[], const int anti_chatter[], double 
     Stops stops;
     double effort[N_JOINTS];
     impact(plant, &value[Q], anti_chatter);
-    find_regime(plant, &value[Q], anti_chatter, ANY_RANK, &stops, a, effort, NULL);
+    find_regime(plant, &value[Q], anti_chatter, ANY_RANK, 0.0, &stops, a, effort, NULL);
     for (int i = 0; i < N_JOINTS; i++)
         held[i] = stops.held[i] != FREE;
 }

@@ -27,9 +27,14 @@ their range.
 """
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
-TIME_RESOLUTION = 2.0**-52
-TOGETHER = 2.0**-25
-"""Fraction of the largest step. Joints that reach rigid stops within it of an event stop with that event."""
+TIME_RESOLUTION, RELEASE_RESOLUTION = 2.0**-52, 2.0**-26
+"""Resolution of the time of an event, as a fraction of the step. At a release the acceleration is 0, so that the error
+of the state grows with the square of that of the time.
+"""
+TOGETHER, WINDOW = 2.0**-25, 2.0**-13
+"""Fractions of the largest step. Joints that reach rigid stops within the first of an event stop with it. Joints
+that an impact moves, and that come to rest within the second, stop with the impact.
+"""
 THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
 
 
@@ -40,12 +45,10 @@ class Event:
     Attributes:
         stopped: joints that reached a limit, or are still at one and turn towards it.
         arrested: joints that slipped and have no velocity left.
-        released: joints that are released from rest.
     """
 
     stopped: list[int] = field(default_factory=list)
     arrested: list[int] = field(default_factory=list)
-    released: list[int] = field(default_factory=list)
 
 
 def search(
@@ -64,7 +67,7 @@ def search(
     if at_b >= 0.0 and (halvings == 0 or at_a + at_b >= rate * (b - a)):
         return inf
     if halvings == 0:
-        return locate(margin, a, at_a, b, at_b, step)
+        return locate(margin, a, at_a, b, at_b, TIME_RESOLUTION * step)
     middle = 0.5 * (a + b)
     at_middle = margin(middle)
     first = search(margin, rate, a, at_a, middle, at_middle, step, halvings - 1)
@@ -73,7 +76,7 @@ def search(
     return first
 
 
-def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float) -> float:
+def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, resolution: float) -> float:
     """Return the first time in (a, b] at which a margin is negative, given that it is at b.
 
     The interpolation stays near the middle, so that it never needs many more evaluations than bisection. Source:
@@ -83,9 +86,9 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: f
         margin: the margin.
         a, b: times within the step, s.
         at_a, at_b: the margin there.
-        step: size of the step, s.
+        resolution: of the time, s.
     """
-    resolution, k = TIME_RESOLUTION * step, 0.2 / (b - a)
+    k = 0.2 / (b - a)
     slack = b - a  # how much longer the interval may be than after bisection
     while b - a > resolution:
         middle, half = 0.5 * (a + b), 0.5 * (b - a)
@@ -120,7 +123,7 @@ def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float
         after = turn * step
         at_after = margin(after)
         if at_after < 0.0:
-            return locate(margin, before, at_before, after, at_after, step)
+            return locate(margin, before, at_before, after, at_after, TIME_RESOLUTION * step)
         before, at_before = after, at_after
     return inf
 
@@ -188,7 +191,7 @@ def first_release(
 
     instant = TIME_RESOLUTION * step
     if margin(instant) < 0.0:
-        return instant  # a release by rounding, which bisection would find in fifty steps
+        return instant  # a release by rounding
     inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
     margins = [at_ends[0], *inner, at_ends[1]]
     looks = [x * step for i in doubtful for x in _doubtful_minima([m[i] for m in margins])]
@@ -202,7 +205,7 @@ def first_release(
             if at_look < 0.0:
                 b, at_b = look, at_look
         if at_b < 0.0:
-            return locate(margin, a, at_a, b, at_b, step)
+            return locate(margin, a, at_a, b, at_b, RELEASE_RESOLUTION * step)
     return inf
 
 

@@ -25,7 +25,7 @@ from .equations import Equations
 from .pseudo_inverse import rank_margin
 from .rosenbrock import CUBIC, damping_limits, rosenbrock
 from .step_error import StepError, fastest_joint
-from .stops import STUCK, Stops
+from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
@@ -72,17 +72,22 @@ class _Motion:
         self.grips: list[list[float]] = []
         self.margins: list[float] = []
 
-    def set_out(self, y: State, kept: Sequence[bool], rank_held: bool) -> State:
-        """Determine the regime at a state after an impact; return ẏ in it.
+    def set_out(self, y: State, anti_chatter: Sequence[bool], kept: Sequence[bool], rank_held: bool) -> State:
+        """Apply an impact and determine the regime after it; return ẏ in it.
 
         Args:
-            y: the state (q, v).
+            y: the state (q, v); changed.
+            anti_chatter: joints that stop in both directions.
             kept: joints that stay at rest even if the holding effort exceeds its bounds.
             rank_held: whether the rank stays as it is.
         """
-        self.rank_held = rank_held
+        self.rank_held, rank = rank_held, self.rank if rank_held else None
+        hits = self.stops.impact(y, anti_chatter) and self.stops.rigid
         self.stops.slide(y[self.n :])
-        a, self.rank, margin = self._acceleration(y, self.rank if rank_held else None)
+        a, self.rank, margin = self._acceleration(y, rank)
+        if hits and self.stops.stop_within(events.WINDOW * self.max_step, y, a, kept):
+            self.stops.slide(y[self.n :])
+            a, self.rank, margin = self._acceleration(y, rank)
         self.grips, self.margins = [self.stops.hold(y, a, kept)], [margin]
         return y[self.n :] + a
 
@@ -230,9 +235,6 @@ class _Motion:
     def _event(self, y: State, together: Sequence[int]) -> tuple[State, events.Event]:
         """Return a state with positions clipped to limits and reversed velocities set to 0, and its event."""
         y, n, stops, event = list(y), self.n, self.stops, events.Event()
-        if stops.watched:
-            grips = self.acceleration(y)[1]
-            event.released = [i for k, i in enumerate(stops.watched) if min(grips[2 * k : 2 * k + 2]) < 0.0]
         for i, (low, high) in enumerate(stops.limits):
             if i in stops.held:
                 continue
@@ -301,10 +303,10 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     joint_hold, slide, stuck = Hold(), Slide(), [Hold() for _ in range(n)]
     left, slipped = [-inf] * n, [-inf] * n  # last release and start of slip
     soon, longest = chatter_time, chatter_time  # times of the holds at limits
-    event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
+    chattering, anti_chatter = [False] * n, [False] * n
     while t < h:
         if any(chattering):
-            joint_hold.again(t, soon, longest)
+            joint_hold.again(t, soon, longest, SHORT_CHATTER_TIME if stops.rigid else FIRST_HOLD)
             anti_chatter = chattering
             if joint_hold.length >= HOLD_OF_ALL * chatter_time:
                 anti_chatter = stops.at_limits(y)
@@ -312,23 +314,15 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
             anti_chatter = [False] * n
         rank, rank_held = motion.rank, slide.until > t
         end = min((hold.until for hold in (joint_hold, slide, *stuck) if hold.until > t), default=h)
-        stops.impact(y, anti_chatter)
         kept = [chatters or hold.until > t for chatters, hold in zip(anti_chatter, stuck)]
-        rates = motion.set_out(y, kept, rank_held)
+        rates = motion.set_out(y, anti_chatter, kept, rank_held)
         for i, at_limit in enumerate(stops.at_limits(y)):
             if at_limit and i not in stops.held:
                 left[i] = t
             if stops.slip[i] and y[n + i] == 0.0 and i not in stops.held:
                 slipped[i] = t
-        held_again = [i for i in event.released if i in stops.watched]  # because of rounding
-        for i in held_again:
-            if stops.rest[i] == STUCK:
-                stuck[i].again(t, short_time, chatter_time)
-        chattering = [i in held_again and stops.rest[i] != STUCK for i in range(n)]
-        event, longest = events.Event(), chatter_time
+        chattering, longest = [False] * n, chatter_time
         soon = chatter_time if stops.rigid else joint_hold.at_once
-        if held_again:
-            continue
         motion.crossed |= t > 0.0 and motion.rank != rank
         if motion.rank > rank:
             slide.rise(t, y[n:])

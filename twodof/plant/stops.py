@@ -60,8 +60,8 @@ class Stops:
         self.held: list[int] = []
         self.watched: list[int] = []
 
-    def impact(self, y: list[float], anti_chatter: Sequence[bool]) -> None:
-        """Remove the velocity that points into a limit from the state (q, v).
+    def impact(self, y: list[float], anti_chatter: Sequence[bool]) -> bool:
+        """Remove the velocity that points into a limit from the state (q, v); return whether there was any.
 
         Args:
             y: the state; changed.
@@ -73,7 +73,7 @@ class Stops:
         fixed = [i for i in sides if anti_chatter[i] or self._has_no_range(i)]
         into = [i for i, side in sides.items() if side * y[n + i] < 0.0 or (i in fixed and y[n + i])]
         if not into:
-            return
+            return False
         if self.rigid:
             W = self._inverse_mass(y[:n])
             bounds = {i: (0.0, inf) if side > 0.0 else (-inf, 0.0) for i, side in sides.items()}
@@ -82,6 +82,34 @@ class Stops:
             into = [i for i in sides if impulse[i]]
         for i in into:
             y[n + i] = 0.0
+        return True
+
+    def stop_within(self, window: float, y: list[float], a: Sequence[float], kept: Sequence[bool]) -> bool:
+        """Stop joints whose motion friction or a rigid stop ends within a window; return whether there are any.
+
+        Args:
+            window: s, > 0.
+            y: the state (q, v) after an impact; changed.
+            a: q̈ in the directions of ``slide``.
+            kept: joints at limits that stop in both directions.
+        """
+        n, sides = len(self.limits), self._sides(y)
+        v, rates, bounds = np.array(y[n:]), [x + window * rate for x, rate in zip(y[n:], a)], {}
+        for i, friction in enumerate(self._friction):
+            side, F, slip = sides.get(i, 0.0), window * friction, self.slip[i]
+            if F or side:  # bounds beyond the friction in a
+                bounds[i] = -inf if side < 0.0 else F * (slip - 1), inf if side > 0.0 else F * (slip + 1)
+        if not any(rates[i] * v[i] < 0.0 for i in bounds):
+            return False
+        W = self._inverse_mass(y[:n])
+        fixed = [i for i in bounds if (kept[i] or self._has_no_range(i)) and (i in sides or v[i] == 0.0)]
+        _, at = _complementary(W, rates, bounds, fixed)
+        resting = [i for i, state in at.items() if state == 0]
+        v += W[:, resting] @ np.linalg.solve(W[np.ix_(resting, resting)], -v[resting])
+        v[resting] = 0.0
+        y[n:] = v.tolist()
+        self.impact(y, kept)
+        return True
 
     def slide(self, v: Sequence[float]) -> list[int]:
         """Set and return the directions of slip at the velocities v."""
@@ -146,7 +174,8 @@ class Stops:
             efforts = {i: -a[i] for i in self.held} | dict(zip(reacting, reaction.tolist()))
         for i in self.held:
             a[i] = 0.0
-        return [grip for i in self.watched for grip in self._grips(i, y[i], efforts[i])]
+        slack = 2.0 * ROUNDING * max(map(abs, efforts.values()))  # a released joint moves
+        return [grip + slack for i in self.watched for grip in self._grips(i, y[i], efforts[i])]
 
     def mobility(self, q: Sequence[float]) -> Array:
         """Return M⁻¹ with joints at rest held, n × n: the accelerations that unit efforts cause."""
@@ -196,8 +225,9 @@ def _complementary(
         raise np.linalg.LinAlgError("not finite")
     at = {}
     for i, (low, high) in bounds.items():
-        pressed = b[i] < 0.0 if high == inf else b[i] > 0.0
-        at[i] = 0 if i in fixed or low < 0.0 < high or pressed else -1 if high == inf else 1
+        upward = low + high > 0.0
+        pressed = b[i] < 0.0 if upward else b[i] > 0.0
+        at[i] = 0 if i in fixed or low < 0.0 < high or pressed else -1 if upward else 1
     z, given, size = np.zeros(len(b)), np.array(b), np.abs(b)
     fewest, tries = len(b) + 1, BLOCK_TRIES
     for _ in range(MOST_PIVOTS):
