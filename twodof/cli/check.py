@@ -1,4 +1,4 @@
-"""Verb check: check an FMU of any vendor against the FMI standard."""
+"""Verb check: check an FMU of any vendor against the standard."""
 
 import argparse
 

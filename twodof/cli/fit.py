@@ -1,4 +1,4 @@
-"""Verb fit: fit a robot's parameters to bags of its motion."""
+"""Verb fit: fit a robot's masses and friction to bags of its motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verb layouts: write files with which other tools show a robot."""
+"""Verb layouts: write layouts of a robot for RViz, PlotJuggler and Foxglove."""
 
 import argparse
 

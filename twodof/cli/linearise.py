@@ -1,4 +1,4 @@
-"""Verb linearise: show the linear model of an FMU at an operating point."""
+"""Verb linearise: show the linear model of a native FMU about an operating point."""
 
 from __future__ import annotations
 

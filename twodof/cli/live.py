@@ -1,4 +1,4 @@
-"""Verb live: drive an FMU in the browser."""
+"""Verb live: run an FMU in the browser and drag its target."""
 
 import argparse
 

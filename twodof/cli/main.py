@@ -23,23 +23,8 @@ from .options import CommandLineError
 from .printing import CLEAR, in_options, say
 from .signals import INTERRUPTED, is_interrupt
 
-VERBS = {
-    build: "build an FMU from a URDF",
-    run: "simulate an FMU and write a bag",
-    publish: "step an FMU in real time on a ROS 2 network",
-    layouts: "write layouts of a robot for RViz, PlotJuggler and Foxglove",
-    check: "check an FMU of any vendor against the standard",
-    info: "show the contents of an FMU, a bag or a sweep",
-    linearise: "show the linear model of a native FMU about an operating point",
-    fit: "fit a robot's masses and friction to bags of its motion",
-    plot: "draw bags, or the map of a sweep, into one figure",
-    view: "replay a bag in the browser",
-    live: "run an FMU in the browser and drag its target",
-    page: "write a robot as one HTML file that runs",
-    sweep: "run an FMU over many gains, and map the results",
-    export: "write a bag as a table, or as one MCAP file",
-    recover: "complete a bag whose writer died",
-}
+VERBS = (build, run, publish, layouts, check, info, linearise, fit, plot, view, live, page, sweep, export, recover)
+"""The verbs in the order of the help, which has the first line of each docstring."""
 LONGEST_LINE = 2000
 
 
@@ -52,7 +37,8 @@ def parser() -> tuple[Parser, dict[str, Parser]]:
     )
     program.add_argument("--version", action="version", version=f"twodof {__version__}")
     verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for verb, text in VERBS.items():
+    for verb in VERBS:
+        text = str(verb.__doc__).partition(": ")[2].rstrip(".\n")
         added = verbs.add_parser(verb.__name__.rpartition(".")[2], help=text)
         added.set_defaults(call=verb.call)
         verb.add(added)

@@ -1,4 +1,4 @@
-"""Verb page: write a native FMU as one HTML file."""
+"""Verb page: write a robot as one HTML file that runs."""
 
 import argparse
 

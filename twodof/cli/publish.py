@@ -1,4 +1,4 @@
-"""Verb publish: run an FMU in real time on a ROS 2 network."""
+"""Verb publish: step an FMU in real time on a ROS 2 network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verb run: simulate an FMU, and write its bag."""
+"""Verb run: simulate an FMU and write a bag."""
 
 from __future__ import annotations
 

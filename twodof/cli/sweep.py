@@ -1,4 +1,4 @@
-"""Verb sweep: run an FMU over many gains."""
+"""Verb sweep: run an FMU over many gains, and map the results."""
 
 from __future__ import annotations
 
