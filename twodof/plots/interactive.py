@@ -61,15 +61,21 @@ def body(tracks: Sequence[Track]) -> str:
     return f'{_verdicts(tracks)}<div id="plots"></div>\n{_thinned(tracks, over)}{figures_html(content)}'
 
 
-def figures_html(content: object) -> str:
-    """Return the HTML that draws figures and the rows of their legend into the page's element "plots".
+def figures_html(content: object, name: str = "interactive.js") -> str:
+    """Return the HTML with plotly's library and the content, both compressed, and the script that draws them.
+
+    ``interactive.js`` draws figures, and the rows of their legend, into the page's element "plots".
 
     Raises:
         PlotError: plotly is missing.
     """
     with needing(PlotError, "plot into a page", "view"):
         from plotly.offline import get_plotlyjs
-    return scripts("interactive.js", get_plotlyjs(), content)
+    return (
+        f'<script type="text/plain" id="library">{packed(get_plotlyjs().encode())}</script>\n'
+        f'<script type="text/plain" id="content">{packed(json.dumps(content).encode())}</script>\n'
+        f"<script>\n{script('plots', name)}</script>\n"
+    )
 
 
 def _verdicts(tracks: Sequence[Track]) -> str:
@@ -78,15 +84,6 @@ def _verdicts(tracks: Sequence[Track]) -> str:
     if len(tracks) > 1:
         lines = [f"{label}: {track.verdict.lines[0]}" for label, track in zip(labels(tracks), tracks)]
     return f'<p class="verdict">{"<br/>".join(map(html.escape, lines))}</p>\n'
-
-
-def scripts(name: str, library: str, content: object) -> str:
-    """Return the HTML with plotly's library and the content, both compressed, and the script that draws them."""
-    return (
-        f'<script type="text/plain" id="library">{packed(library.encode())}</script>\n'
-        f'<script type="text/plain" id="content">{packed(json.dumps(content).encode())}</script>\n'
-        f"<script>\n{script('plots', name)}</script>\n"
-    )
 
 
 def _numbers(values: Array) -> dict[str, str]:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from ..bag.reader import read_bag
 from ..errors import BagError
 from ..sweeps.ranking import METRICS, beyond_limits
-from .interactive import scripts
+from .interactive import figures_html
 from .settings import UNITS
 from .strokes import downsampled
 
@@ -36,9 +37,7 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
         bags: folder with a bag of each run, whose curves are shown when the run is clicked; None: none.
         best: initially selected run, if any.
     """
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError:
+    if find_spec("plotly") is None:
         return ""
     rows = table.iloc[:: max(1, -(-len(table) // MOST_RUNS))]
     metrics = [name for name in METRICS if rows[name].notna().any()]
@@ -57,7 +56,7 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
         + [f"--set '{name}={str(value).lower()}'" for name, value in options["settings"].items()],
         "curves": _curves(rows, bags),
     }
-    return f'<div id="maps"></div>\n{scripts("maps.js", get_plotlyjs(), content)}'
+    return f'<div id="maps"></div>\n{figures_html(content, "maps.js")}'
 
 
 def _numbers(values: NDArray[np.float64]) -> list[float | None]:
