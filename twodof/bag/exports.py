@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import BagError, path_of
 from ..files import refusing, temporary_folder, write_file
 from ..plant.urdf import RobotError, read_urdf
-from ..version import install
+from ..version import needing
 from .contents import storage_files
 from .lerobot import write_dataset
 from .provenance import robot_in
@@ -82,14 +82,12 @@ def _csv(columns: dict[str, tuple[str, Array]]) -> bytes:
 
 
 def _parquet(columns: dict[str, tuple[str, Array]]) -> bytes:
-    try:
+    with needing(BagError, "write a Parquet file", "sweep"):
         import pandas as pd
 
         table = pd.DataFrame({name: values for name, (_, values) in columns.items()})
         table.attrs["units"] = {name: unit for name, (unit, _) in columns.items()}
         return bytes(table.to_parquet(index=False))
-    except ImportError as missing:
-        raise BagError(f"{missing}; {install('sweep')}") from missing
 
 
 def _mcap(bag: Path) -> bytes:

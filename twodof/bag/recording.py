@@ -25,6 +25,7 @@ from ..simulation.setup import Setup, robot_of
 from ..simulation.setup import setup as setup_of
 from ..simulation.verdict import SHAPE, judged, verdict_in
 from ..simulation.verdict import Verdict as Verdict
+from ..version import needing
 from .provenance import KNOWN_UNTIL, MAX_TAIL, Provenance
 from .records import Stamps
 
@@ -233,10 +234,8 @@ class Recording:
         Raises:
             BagError: pandas is missing.
         """
-        try:
+        with needing(BagError, "make a DataFrame", "sweep"):
             import pandas as pd
-        except ImportError as missing:
-            raise BagError(f"{missing}; pip install pandas") from missing
         parts = {"q": self.q, "v": self.v, "tau": self.tau, "x": self.x, "x_des": self.target}
         columns = {f"{group}[{i + 1}]": part[:, i] for group, part in parts.items() for i in range(part.shape[1])}
         return pd.DataFrame(columns, index=pd.Index(self.t, name="t"))
