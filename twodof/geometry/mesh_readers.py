@@ -25,17 +25,22 @@ NO_COLOUR = (-1, -1, -1)
 
 def serve(pipe: Connection, kind: str, folder: Path, seconds: int) -> None:
     """Read the mesh files that the parent names over the pipe, one after another, within limits of processor time."""
+    read, libraries = READERS[kind]
+    reason = ""
     try:
-        read = {"shape": _coal, "colours": _trimesh}[kind]()
+        for library in libraries:  # a confined process cannot import
+            import_module(library)
     except ImportError as missing:
-        read = _refusing(f"{missing}; install the package '{missing.name}'")
+        reason = f"{missing}; install the package '{missing.name}'"
     confine(MAX_MESH_MEMORY, seconds, [folder])
     while True:
-        name, library = pipe.recv()
+        name, material = pipe.recv()
         limit_time(MAX_MESH_SECONDS)
+        path = folder / name
         try:
-            path = folder / name
-            colours = (folder / library).read_bytes() if library else None
+            if reason:
+                raise ValueError(reason)
+            colours = (folder / material).read_bytes() if material else None
             parts = read(path.read_bytes(), path, colours)
             if sum(len(triangles) for _, triangles, _ in parts) > MAX_TRIANGLES:
                 raise ValueError(f"it has more than {MAX_TRIANGLES} triangles")
@@ -52,13 +57,6 @@ def serve(pipe: Connection, kind: str, folder: Path, seconds: int) -> None:
         pipe.send_bytes(json.dumps(answer).encode())
 
 
-def _refusing(reason: str) -> Reader:
-    def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
-        raise ValueError(reason)
-
-    return read
-
-
 def _reason(error: Exception, path: Path) -> str:
     """Return an error as one line, without the file name and the hint that coal adds."""
     text = " ".join(str(error).split()) or type(error).__name__
@@ -67,38 +65,37 @@ def _reason(error: Exception, path: Path) -> str:
     return text.replace("std::bad_alloc", f"it takes more than {MAX_MESH_MEMORY // 2**20} MiB")
 
 
-def _coal() -> Reader:
+def _coal(content: bytes, path: Path, library: bytes | None) -> list[Part]:
     import coal
 
-    def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
-        # axis-aligned boxes: others take longer, and print warnings on degenerate triangles
-        mesh = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
-        if mesh.num_tris > MAX_TRIANGLES:
-            raise ValueError(f"it has {mesh.num_tris} triangles, at most {MAX_TRIANGLES}")
-        triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
-        faces = np.array(triangles, dtype=np.uint32).reshape(-1, 3)
-        return [(np.array(mesh.vertices(), dtype=np.float64), faces, None)]
-
-    return read
+    # axis-aligned boxes: others take longer, and print warnings on degenerate triangles
+    mesh = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
+    if mesh.num_tris > MAX_TRIANGLES:
+        raise ValueError(f"it has {mesh.num_tris} triangles, at most {MAX_TRIANGLES}")
+    triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
+    faces = np.array(triangles, dtype=np.uint32).reshape(-1, 3)
+    return [(np.array(mesh.vertices(), dtype=np.float64), faces, None)]
 
 
-def _trimesh() -> Reader:
+def _trimesh(content: bytes, path: Path, library: bytes | None) -> list[Part]:
     import trimesh
 
-    import_module("collada")  # trimesh imports it on use, which a confined process cannot
+    files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # for any name
+    scene = trimesh.load_scene(io.BytesIO(content), file_type=path.suffix[1:], resolver=files, process=False)
+    parts: list[Part] = []
+    for mesh in scene.dump():
+        material = getattr(mesh.visual, "material", None)
+        colour = None
+        if material is not None and not (path.suffix == ".obj" and library is None):
+            colour = [float(value) / 255.0 for value in material.main_color[:3]]
+        parts.append((np.array(mesh.vertices), np.array(mesh.faces, dtype=np.uint32), colour))
+    if not parts:
+        raise ValueError("the file has no triangles")
+    return parts
 
-    def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
-        files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # for any name
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=path.suffix[1:], resolver=files, process=False)
-        parts: list[Part] = []
-        for mesh in scene.dump():
-            material = getattr(mesh.visual, "material", None)
-            colour = None
-            if material is not None and not (path.suffix == ".obj" and library is None):
-                colour = [float(value) / 255.0 for value in material.main_color[:3]]
-            parts.append((np.array(mesh.vertices), np.array(mesh.faces, dtype=np.uint32), colour))
-        if not parts:
-            raise ValueError("the file has no triangles")
-        return parts
 
-    return read
+READERS: dict[str, tuple[Reader, tuple[str, ...]]] = {
+    "shape": (_coal, ("coal",)),
+    "colours": (_trimesh, ("trimesh", "collada")),
+}
+"""Readers, and the libraries that they need."""
