@@ -30,7 +30,7 @@ class JointTrack:
     Attributes:
         unit: "rad" or "m"; "" if the robot is unknown.
         low, high: position limits of the run, or else of the URDF; None if unknown.
-        effort, speed: limits of the URDF, N·m or N, rad/s or m/s; None if unknown.
+        effort: limit of the URDF, N·m or N; None if unknown.
         q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample, N
             values each; unknown ones are empty.
         has_friction: whether it has friction.
@@ -41,7 +41,6 @@ class JointTrack:
     low: float | None
     high: float | None
     effort: float | None
-    speed: float | None
     q: Array
     v: Array
     tau: Array
@@ -213,21 +212,20 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
     joints = []
     for i, name in enumerate(names):
         unit = ""
-        limits = [starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]"), None, None]
+        limits = [starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]"), None]
         if linkage is not None and name in linkage.urdf.joints:
             joint = linkage.urdf.joints[name]
             unit = "m" if joint.prismatic else "rad"
-            own = (joint.low, joint.high, joint.effort, joint.velocity)
+            own = (joint.low, joint.high, joint.effort)
             limits = [b if a is None else a for a, b in zip(limits, own)]
-        limits = [None if x is None or abs(x) >= UNBOUNDED else x for x in limits]
-        low, high, effort, speed = limits
+        low, high, effort = (None if x is None or abs(x) >= UNBOUNDED else x for x in limits)
         q, v, tau, target = (
             values[:, i] if values.shape == bag.q.shape else np.empty(0) for values in (bag.q, bag.v, efforts, targets)
         )
         if effort is not None and first.get("limit_effort"):  # commands may exceed it; a bag's efforts do not
             tau = np.clip(tau, -effort, effort)
         has_friction = bool(first.get(f"friction[{i + 1}]"))
-        joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target, has_friction))
+        joints.append(JointTrack(name, unit, low, high, effort, q, v, tau, target, has_friction))
     return tuple(joints)
 
 
