@@ -24,7 +24,7 @@ from bags import (
     read_with_sqlite3,
     sample,
 )
-from harness import wait_until
+from harness import python, wait_until
 from mcap.exceptions import EndOfFile
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -39,25 +39,7 @@ from twodof.simulation.experiments import Experiment
 MIB = 1024**2
 
 
-@pytest.fixture(scope="module")
-def run(native_path):
-    return twodof.experiment(native_path)
-
-
 # --- where it may be written ---
-
-
-def test_existing_bag_is_kept_unless_told_otherwise(run, tmp_path):
-    path = tmp_path / "bag"
-    with twodof.Bag(path).begin(run) as bag:
-        bag.write(sample(run, 0))
-    with pytest.raises(BagError, match="exists already"):
-        twodof.Bag(path)
-    assert len(read_with_rosbags(path)) == 1
-    with twodof.Bag(path, overwrite=True).begin(run) as bag:
-        for k in range(3):
-            bag.write(sample(run, k))
-    assert len(read_with_rosbags(path)) == 3
 
 
 @pytest.mark.parametrize("moment", ["remove", "open", "add_connection"])
@@ -298,8 +280,7 @@ print(memory.growth)
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @both_storages
 def test_memory_does_not_grow_with_the_run(native_path, tmp_path, storage):
-    command = [sys.executable, "-c", MEMORY, str(native_path), str(tmp_path / "bag"), storage]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    done = python("-c", MEMORY, native_path, tmp_path / "bag", storage, cwd=Path(__file__).parent, check=True)
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000
 

@@ -5,7 +5,6 @@ import json
 import math
 import os
 import re
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import oracles
 import pytest
 from figures import assert_legible, only, panels
+from harness import python
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -178,15 +178,8 @@ def test_equal_bags_give_equal_files(gains, tmp_path):
 
     That is: nothing is imported for it that takes long.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", PLOT, gains[20].bag],
-        cwd=tmp_path,
-        check=True,
-        env={**ENVIRONMENT, "PYTHONHASHSEED": "1", "SOURCE_DATE_EPOCH": "1"},
-        timeout=60,
-        capture_output=True,
-        text=True,
-    )
+    environment = {**ENVIRONMENT, "PYTHONHASHSEED": "1", "SOURCE_DATE_EPOCH": "1"}
+    done = python("-c", PLOT, gains[20].bag, cwd=tmp_path, check=True, env=environment)
     assert done.stdout == "set()\n"
     drawn = drawing(read_tracks([gains[20].bag]))
     for kind in ("png", "svg", "pdf", "html"):
@@ -279,13 +272,7 @@ def test_a_window_opens_where_there_is_a_display(default, tmp_path):
     given = [(display, backend) for display, backend, _ in cases]
     environment = {k: v for k, v in ENVIRONMENT.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
-    done = subprocess.run(
-        [sys.executable, "-c", SHOW, default.bag, json.dumps(given)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=environment,
-    )
+    done = python("-c", SHOW, default.bag, json.dumps(given), env=environment)
     assert done.stdout == "".join(f"{said}\n" for *_, said in cases), done.stderr
 
 
@@ -320,7 +307,7 @@ def test_what_else_is_wrong_is_named(default, tmp_path, monkeypatch):
 
 def test_without_matplotlib_it_says_what_to_install():
     code = "import sys; sys.modules['matplotlib'] = None; import twodof.plots.runs"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, timeout=60)
+    done = python("-c", code, env=ENVIRONMENT)
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith("twodof.errors.PlotError: cannot plot: ")
     assert "install the extra 'view': " in last
@@ -353,18 +340,3 @@ def test_the_command_says_where_the_plot_is_and_what_came_out(gains, foreign, ur
     printed = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in printed] == ["plot", "Kp = 20 s⁻²", "Kp = 50 s⁻²"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["Kp50.png", "a.svg", "both.html", "ur5.urdf"]
-
-
-def test_the_command_fails_in_one_line(default, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for arguments, message in (
-        (["gone", "-o", "a.jpg"], "'a.jpg': the name of a plot ends in"),  # before bags are read
-        ([str(default.bag), "-o", "gone/a.png"], "cannot write 'gone/a.png'"),
-        ([str(default.bag), "--urdf", "gone"], "there is no URDF 'gone'"),
-        (["gone"], "'gone'"),
-    ):
-        assert main(["plot", *arguments]) == 1
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("twodof: error: ")
-        assert message in line
-    assert list(tmp_path.iterdir()) == []

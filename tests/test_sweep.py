@@ -1,7 +1,6 @@
 """Sweeps: metrics against closed forms, the design, and the outcome of each run."""
 
 import shlex
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import oracles
 import pytest
-from harness import changed_step
+from harness import changed_step, python
 from tables import BEGUN, SMALL, same
 
 import twodof
@@ -177,7 +176,6 @@ def test_a_name_without_an_index_sets_all_elements(native_path):
         (["--grid", "q=1:2:3"], "q[1] is of causality 'output' and cannot be set"),
         (["--grid", "Kp=5:1:3"], "LOW 5 must be below HIGH 1"),
         (["--grid", "Kp=1:2:0"], "COUNT 0 must be a whole number of at least 2"),
-        (["--grid", "Kp=1:2"], "--grid Kp=1:2: expected NAME=LOW:HIGH:COUNT"),
         (["--grid", "Kp=1:nan:3"], "its numbers must be finite"),
         (["--grid", "Kp=1:2:3", "--grid", "Kp=1:2:3"], "--grid Kp is given twice"),
         (
@@ -187,7 +185,6 @@ def test_a_name_without_an_index_sets_all_elements(native_path):
         (["--grid", "Kp=1:2:3", "--set", "Kp[1]=4"], "Kp[1] gets values from the settings and from Kp"),
         (["--range", "Kp=1:2"], "0 random draws of Kp; give at least 1 with --random"),
         (["--range", "Kp=2:1", "--random", "3"], "LOW 2 must be below HIGH 1"),
-        (["--random", "3"], "there is nothing to vary"),
         (["--grid", "Kp=1:2:3", "--random", "3"], "3 random draws of nothing; give a range"),
         ([], "there is nothing to vary"),
         (["--grid", "Kp=1:2:3", "--stop-time", "-1"], "stop time -1 s must be after"),
@@ -224,13 +221,7 @@ def test_bad_input_gets_one_line(arguments, said, native_path, tmp_path, monkeyp
 def test_a_missing_extra_is_named(package, extra, options, native_path, tmp_path):
     missing = f"import sys; sys.modules[{package!r}] = None; "
     code = missing + "from twodof.__main__ import main; sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "sweep", str(native_path), "--grid", "Kp=1:2:2", *options],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-c", code, "sweep", native_path, "--grid", "Kp=1:2:2", *options, cwd=tmp_path)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert package in line and f"install the extra '{extra}': {sys.executable} -m pip" in line
