@@ -3,8 +3,6 @@
 Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
 """
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import struct

@@ -1,7 +1,5 @@
 """A browser on a page of ``twodof view`` or ``twodof live``, and the command behind the page."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

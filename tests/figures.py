@@ -1,7 +1,5 @@
 """Contents of a figure of runs, by its artists."""
 
-from __future__ import annotations
-
 import re
 from typing import Any, NamedTuple
 

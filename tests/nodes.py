@@ -4,8 +4,6 @@ The nodes are another maker's DDS, with an IDL of its own; bags are read by the 
 reader. All stays on the loopback interface, or in network namespaces that lead nowhere.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

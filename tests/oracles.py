@@ -1,7 +1,5 @@
 """Closed forms with which tests compare, independent of the package."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from pathlib import Path
 

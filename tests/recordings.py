@@ -1,7 +1,5 @@
 """Bags for figures: of runs with their samples, and in the form of other recorders."""
 
-from __future__ import annotations
-
 import pickle
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A temporary folder for each run of the tests; a file that a test leaves there fails the run."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """Sinks that keep the samples of a run, or measure its memory."""
 
-from __future__ import annotations
-
 import resource
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables of sweeps, read by an independent reader of Parquet."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -4,7 +4,6 @@ import importlib
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,6 @@ from scipy.integrate import solve_ivp
 from tools import needs
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-Mujoco = Callable[[str, int], tuple[float, list[float]]]
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,6 @@ from ruamel.yaml import YAML
 import twodof
 from twodof.cli.main import main
 
-QOS = {"Reliability Policy": "reliability", "Durability Policy": "durability"}
-
 
 @pytest.fixture(scope="module", params=["task", "pose", "joint", "effort"])
 def bag(request, tmp_path_factory):

@@ -17,7 +17,7 @@ import pytest
 from bags import SECOND
 from harness import wait_until
 from mcap.reader import make_reader
-from nodes import Node, ended, environment, published, recorded, stamp_of
+from nodes import ended, environment, published, recorded, stamp_of
 
 import twodof
 from twodof.cli.main import main
@@ -26,7 +26,6 @@ from twodof.ros.network import network_of_environment
 
 GAINS = {2: (2.0, 0.2), 7: (60.0, 8.0)}
 GOALS = {2: (0.9, -0.6), 7: (0.3, -0.4, 0.2, -1.8, 0.1, 1.6, 0.5)}
-Listen = Callable[..., Node]
 
 
 def pd(sample: twodof.Sample, n: int) -> list[float]:
