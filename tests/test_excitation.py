@@ -84,7 +84,9 @@ def test_the_command_writes_inputs_of_a_run(motion, tmp_path, capsys, monkeypatc
     output, gravity = tmp_path / "excite.csv", [*map(str, GRAVITY)]
     assert main(["fit", str(ARM), "--design", "20", *free, "--gravity", *gravity, "-o", str(output)]) == 0
     printed = capsys.readouterr().out
-    assert f"are {motion[0].factor:.3g} times narrower" in printed and output.read_bytes() == motion[1].read_bytes()
+    assert (
+        f"intervals {motion[0].factor:.3g} times narrower" in printed and output.read_bytes() == motion[1].read_bytes()
+    )
     assert "--control joint --set q_start=0,0 " in printed
     options = twodof.FmuOptions(native=True, control="joint", q_start=(0.0, 0.0), settings={"friction": [0.08, 0.05]})
     fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)

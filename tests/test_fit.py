@@ -108,6 +108,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         effort = 1000.0 * effort
     elif change == "repeated":
         stamps[500:] -= stamps[500] - stamps[200]
+    elif change == "set back":  # by 0.403 s, so that samples are mixed
+        stamps[1500:] -= 403_000_000
     elif change == "no efforts":
         effort = None
     elif change == "slow":
@@ -124,6 +126,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("nan", "the position of joint 'joint2' at 7 s is no number"),
         ("millinewton", "a factor of 1000"),
         ("repeated", "several joint states at one time"),
+        ("set back", "was the clock set back"),
         ("no efforts", "has no efforts"),
         ("slow", "a fit needs 20"),
     ],

@@ -85,22 +85,15 @@ def _design(options: argparse.Namespace) -> int:
     from ..simulation.progress import counting
 
     output = Path(options.output or "excite.csv")
+    given = given_options(options, "frame", "gravity") | {"lock": parse_locks(options.locks), "output": output}
     with counting("designing", "step", shown=sys.stderr.isatty()) as progress:
-        result = excite(
-            options.robot,
-            options.design,
-            options.free,
-            output=output,
-            lock=parse_locks(options.locks),
-            progress=progress,
-            **given_options(options, "frame", "gravity"),
-        )
+        result = excite(options.robot, options.design, options.free, progress=progress, **given)
     if options.json:
-        print_json(output=str(output), factor=result.factor, ratios=dict(zip(result.names, result.ratios.tolist())))
+        print_json(output=str(output), factor=result.factor)
         return 0
-    print_table(*result.rows)
-    for remark in result.remarks:
-        say(f"note: {remark}")
+    gain = f"intervals {result.factor:.3g} times narrower than with random motions within the same limits"
+    say(f"motion: {output}, {gain}")
+    say("note: collisions are not checked: look at the motion in a simulation before a robot follows it")
     start = ",".join(f"{q:.9g}" for q in result.q[0])
     print_next(
         f"twodof build {quote(options.robot)}{_same(options)} --control joint --set q_start={start} -o Robot.fmu",

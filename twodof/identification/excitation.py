@@ -54,8 +54,6 @@ class Excitation(NamedTuple):
         joints: names of the robot's n joints.
         t: time, s, N.
         q, v, a: positions, rad or m, and their derivatives, N × n.
-        names: names of the free parameters.
-        ratios: ratio of each parameter's interval to that of a random motion within the same limits.
         factor: how many times narrower the intervals are, the geometric mean over all directions of the parameters.
     """
 
@@ -64,23 +62,7 @@ class Excitation(NamedTuple):
     q: Array
     v: Array
     a: Array
-    names: tuple[str, ...]
-    ratios: Array
     factor: float
-
-    @property
-    def rows(self) -> list[tuple[str, str]]:
-        """Cells of the table: name, and interval relative to that of a random motion."""
-        head = ("parameter", "interval, of a random motion's")
-        return [head, *((name, f"{100.0 * ratio:.3g} %") for name, ratio in zip(self.names, self.ratios))]
-
-    @property
-    def remarks(self) -> list[str]:
-        """Gain over random motions, and a warning."""
-        return [
-            f"intervals of a fit are {self.factor:.3g} times narrower than with random motions within the same limits",
-            "collisions are not checked: look at the motion in a simulation before a robot follows it",
-        ]
 
     def save(self, path: str | Path) -> Path:
         """Write the motion as a CSV file of inputs for joint control; return its path.
@@ -98,12 +80,6 @@ class Excitation(NamedTuple):
 
 class _Design:
     """Motions of a robot within its limits, and what a fit can tell from them.
-
-    Args:
-        robot: the robot.
-        speed: speed limits of its joints, rad/s or m/s; infinite without one.
-        parameters: the free parameters.
-        seconds: duration, s.
 
     Attributes:
         shape: shape of the coefficients a and b: n × 2 × harmonics.
@@ -184,11 +160,6 @@ class _Design:
         J = information_root(self._parameters, rows, sd, self._z) * self._scales
         return np.asarray(np.linalg.inv(J.T @ J + PRIOR**-2 * np.eye(len(self._z)))[:-1, :-1])
 
-    def deviations(self, motion: Stretch) -> Array:
-        """Return the standard deviations of the reported parameters after a fit to a motion."""
-        rates = self._parameters.rates(self._z[:-1])[0] * self._scales[:-1]
-        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", rates, self._covariance(motion), rates)))
-
     def cost(self, coefficients: Array) -> float:
         """Return the mean logarithm of the standard deviations in all directions."""
         covariance = self._covariance(self.motion(coefficients, COARSE))
@@ -211,18 +182,13 @@ def excite(
     Collisions are not considered. The design is the same on each call.
 
     Args:
-        urdf: the URDF or xacro file.
+        urdf, free, frame, lock, gravity, progress: as for ``fit``; ``gravity`` None: (0, 0, −9.81).
         seconds: duration, s.
-        free: names or shell patterns of the free parameters, as for ``fit``.
         output: CSV file of the motion; None: nothing is written.
-        frame: link of the payload; None: "EndEffector", or the only last link.
-        lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
-        gravity: m/s² in the root frame; None: (0, 0, −9.81).
-        progress: called with the numbers of finished and of all steps.
 
     Raises:
-        InputError: the duration is out of range, a pattern matches no parameter, or an effort limit is too small to
-            hold the robot.
+        InputError: the duration is out of range, a pattern matches no parameter, an effort limit does not hold the
+            robot, or the file cannot be written.
         BuildError: the URDF cannot be read.
     """
     check_gravity(gravity)
@@ -248,10 +214,8 @@ def excite(
         design.cost, [(-BOUND, BOUND)] * candidates.shape[1], init=candidates, maxiter=GENERATIONS, tol=0.0,
         mutation=(0.3, 0.7), recombination=0.5, polish=False, rng=rng, callback=finished,
     )  # fmt: skip
-    median = candidates[np.argsort(costs)[CANDIDATES // 2]]
-    sd, other = (design.deviations(design.motion(each, COARSE)) for each in (best.x, median))
     motion, factor = design.motion(best.x, FINE), float(np.exp(np.median(costs) - best.fun))
-    result = Excitation(robot.joints, motion.t, motion.q, motion.v, motion.a, parameters.names, sd / other, factor)
+    result = Excitation(robot.joints, motion.t, motion.q, motion.v, motion.a, factor)
     if output is not None:
         result.save(output)
     return result

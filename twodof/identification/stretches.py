@@ -33,6 +33,7 @@ HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
+MIXED = 0.03  # second difference of positions between close samples, as part of their range, that shows mixed samples
 MOST_KURTOSIS, MOST_BEND = 30.0, 5.0
 """Second differences of efforts that show jumps: kurtosis (of noise 0, of a few jumps over 100), and largest one in
 standard deviations of the effort. A reversal of friction alone gives at most 2.
@@ -90,6 +91,12 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
             raise InputError(f"'{name}' has too few joint states, or several at one time")
         if (np.diff(t) == 0.0).any():
             raise InputError(f"'{name}' has several joint states at one time: are there two recordings in it?")
+        close, rough = np.minimum(np.diff(t)[1:], np.diff(t)[:-1]) < 0.9 * h, np.abs(np.diff(q, 2, axis=0)).max(axis=1)
+        if close.any() and np.median(rough[close]) > max(MIXED * np.ptp(q, axis=0).max(), 5.0 * np.median(rough)):
+            at = t[1:-1][close][rough[close].argmax()]
+            raise InputError(
+                f"the positions in '{name}' jump at {at:.4g} s: was the clock set back, or are there two bags?"
+            )
         if 1.0 / h < LEAST_RATE:
             raise InputError(f"'{name}' has {1.0 / h:.3g} joint states a second; a fit needs {LEAST_RATE:g}")
         cuts = [0, *(np.flatnonzero(np.diff(t) > GAP * h) + 1), len(t)]
