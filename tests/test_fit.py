@@ -191,3 +191,17 @@ def test_efforts_that_jump_between_samples_are_named(tmp_path):
     assert set(result.jumps) == {*JOINTS} and all((t / 0.5) % 1.0 < 0.05 for t in result.jumps.values())
     assert not result.explains
     assert "the effort of joint 'joint1' jumps between samples, most at" in str(result)
+
+
+def test_damping_of_a_robot_of_one_joint_is_found(tmp_path):
+    """A wheel on a vertical axis: the effort is I a + d v."""
+    urdf = tmp_path / "wheel.urdf"
+    urdf.write_text("""<robot name="wheel"><link name="base"/><link name="rim"><inertial><mass value="1"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="hub" type="continuous"><parent link="base"/><child link="rim"/><axis xyz="0 0 1"/>
+      <limit effort="10" velocity="10"/></joint></robot>""")
+    t = np.linspace(0.0, 20.0, 2001)[:, None]
+    q, v, a = np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)
+    result = twodof.fit(urdf, bag_of(tmp_path / "bag", ["hub"], q, 0.1 * a + 0.3 * v), "damping[*]")
+    (damping,) = result.parameters
+    assert damping.after == pytest.approx(0.3, abs=1e-3)

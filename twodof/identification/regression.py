@@ -81,11 +81,11 @@ def regressors(robot: Robot, stretch: Stretch, offset: Array) -> tuple[Array, Ar
     still = np.zeros(model.nv)
     regressor = pin.computeJointTorqueRegressor
     for k in range(len(q)):
-        Y[k] = C.T @ regressor(model, data, q[k], v[k], a[k])
+        Y[k] = C.T @ regressor(model, data, q[k], v[k], a[k]).reshape(-1, count)  # one joint: Pinocchio has a vector
     for axis in range(3):
         model.gravity.linear = np.eye(3)[axis]
         for k in range(len(q)):
-            G[k, axis] = C.T @ regressor(model, data, q[k], still, still)
+            G[k, axis] = C.T @ regressor(model, data, q[k], still, still).reshape(-1, count)
     return Y, G
 
 
