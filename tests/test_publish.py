@@ -410,6 +410,7 @@ def test_the_environment_of_ros_2(variables, place):
             "localhost: unknown address; correct CYCLONEDDS_URI",
         ),
         ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
+        ({"ROS_STATIC_PEERS": "127.0.0.1;::1"}, "ROS_STATIC_PEERS: '::1' is not found as an IPv4 host"),
     ],
 )
 def test_a_network_that_cannot_be(native_path, monkeypatch, capfd, variables, culprit):

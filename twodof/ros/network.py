@@ -189,9 +189,9 @@ def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
     peers = tuple(filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")))
     for peer in peers:
         try:
-            socket.getaddrinfo(peer, None)  # otherwise Cyclone DDS would end the process
+            socket.getaddrinfo(peer, None, socket.AF_INET)  # otherwise Cyclone DDS would end the process
         except (OSError, UnicodeError) as error:
-            raise PublishError(f"ROS_STATIC_PEERS: '{peer}' is not found: {error}") from error
+            raise PublishError(f"ROS_STATIC_PEERS: '{peer}' is not found as an IPv4 host: {error}") from error
     return peers
 
 
