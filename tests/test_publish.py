@@ -407,7 +407,7 @@ def test_the_environment_of_ros_2(variables, place):
         ({"CYCLONEDDS_URI": "<Größe/>"}, "cannot be opened.*correct CYCLONEDDS_URI"),
         (
             {"CYCLONEDDS_URI": "<Domain><General><Transport>udp6</Transport></General></Domain>"},
-            "localhost: unknown address; correct CYCLONEDDS_URI",
+            "127.0.0.1: unknown address; correct CYCLONEDDS_URI",
         ),
         ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
         ({"ROS_STATIC_PEERS": "127.0.0.1;::1"}, "ROS_STATIC_PEERS: '::1' is not found as an IPv4 host"),

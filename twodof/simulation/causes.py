@@ -244,15 +244,13 @@ def _load(judge: Judge) -> Iterator[Cause]:
     if judge.held.get("payload") and not judge.held.get("payload_known"):
         yield Cause("load", f"the controller does not know the payload of {judge.held['payload']:g} kg", 1.0)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
-    damped = [name for name in judge.setup.joints if name in joints and joints[name].damping > 0.0]
-    usual = [joints[name].damping if name in joints else 0.0 for name in judge.setup.joints]
-    heavy = [name for name, own, d in zip(judge.setup.joints, usual, judge.given("damping")) if d > 2.0 * own]
-    each = ", ".join(f"'{name}'" for name in heavy or damped)
-    which = "all joints" if len(heavy or damped) == len(usual) > 2 else f"joints {each}"
-    if heavy:
-        yield Cause("load", f"the controller does not know the damping of {which}", 0.4)
-    elif damped:
-        yield Cause("drag", f"the controller does not know the damping of {which} in the URDF", 0.2)
+    usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
+    heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
+    each = heavy or [name for name in usual if usual[name] > 0.0]
+    which = "all joints" if len(each) == len(usual) > 2 else f"joints {', '.join(map(repr, each))}"
+    kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.2)
+    if each:
+        yield Cause(kind, f"the controller does not know the damping of {which}{tail}", share)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
         if values.any():
