@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..version import install
 from .completion import links
+from .fmus import is_robot
 from .help import Parser
 from .options import CommandLineError, add_options, add_output, given_options, not_empty, parse_locks
 from .printing import plain, print_json, print_next, print_table, quote, say
@@ -48,6 +49,8 @@ def call(options: argparse.Namespace) -> int:
         raise CommandLineError("name bags of the robot, or a motion to record with --design S, and not both")
     if options.design is not None:
         return _design(options)
+    if options.robot.is_dir() and (urdf := next(filter(is_robot, map(str, options.bags)), None)):
+        raise CommandLineError(f"the URDF comes first: twodof fit {quote(Path(urdf))} {quote(options.robot)}")
     from ..identification.fitting import fit
     from ..simulation.progress import counting
 

@@ -17,6 +17,11 @@ def is_robot(path: str | None) -> bool:
 def chosen_fmu(options: argparse.Namespace) -> Path:
     """Return the named FMU, or build and return that of the URDF or of the default arm."""
     of_urdf = is_robot(options.fmu)
+    if getattr(options, "robot", "") and not options.fmu:
+        build = f"twodof build --robot {quote(options.robot)}"
+        raise CommandLineError(
+            f"--robot names a component of a system; name the system, or build a robot with '{build}'"
+        )
     if options.frame is not None and not of_urdf:
         raise CommandLineError("--frame applies to a URDF; name one, or leave it out")
     if options.fmu and not of_urdf:

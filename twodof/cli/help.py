@@ -65,6 +65,12 @@ MEANT = {
     "make": "build",
     "create": "build",
     "tune": "sweep",
+    "split": "build",
+    "system": "build",
+    "systems": "build",
+    "ssp": "build",
+    "validate": "check",
+    "test": "check",
     "identify": "fit",
     "calibrate": "fit",
     "html": "page",
@@ -88,6 +94,7 @@ MEANT = {
     "--target": "--set",
     "--csv": "--input",
     "--format": "--storage",
+    "--cost": "--fail-if",
 }
 """Verbs and options of other tools, and the corresponding ones here."""
 COMPLETION = 'completion in bash and zsh: eval "$(register-python-argcomplete twodof)"'
@@ -120,7 +127,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with an error in one line."""
-        message = re.sub(r"invalid (float|int) value: ('.*')$", r"\2 is not a number; leave units out", message)
+        message = re.sub(r"invalid int value: ('.*')$", r"\1 is not a whole number", message)
+        message = re.sub(r"invalid float value: ('.*')$", r"\1 is not a number; leave units out", message)
         message = re.sub(r"expected (\d) arguments$", r"expected \1 numbers with spaces between them", message)
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError, kind_of, neighbour, no_such
 from .help import Parser
-from .options import add_options
+from .options import CommandLineError, add_options
 from .printing import print_json, print_table, say
 from .run import verdict_rows
 from .sweep import best_facts, print_best
@@ -38,7 +38,10 @@ def call(options: argparse.Namespace) -> int:
     folder = Path(str(path).rpartition(":")[0] or path)
     if not path.exists() and not folder.exists() and (near := neighbour(path, "FMU", "bag", "sweep")):
         raise InputError(f"there is no '{path}'; did you mean '{near}'?")
-    if path.is_dir() and any(path.glob("*.parquet")):
+    is_sweep = path.is_dir() and any(path.glob("*.parquet"))
+    if options.cost and not is_sweep:
+        raise CommandLineError(f"--cost ranks the runs of a sweep, and '{path}' is none; leave it out")
+    if is_sweep:
         from ..sweeps.ranking import cost_of
         from ..sweeps.results import read_sweep
 

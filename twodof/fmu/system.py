@@ -107,7 +107,9 @@ def load_fmu(path: str | Path, robot: str = "") -> Fmu:
     if has_member(path, STRUCTURE):
         return load_system(path, robot)
     if robot:
-        raise FmuError(f"'{path}' is no system of which `robot` '{robot}' could be a component")
+        raise FmuError(
+            f"'{path}' is an FMU and no system, of which `robot` '{robot}' would be a component; leave it out"
+        )
     return logged(load_any_fmu(path))
 
 

@@ -6,6 +6,7 @@ Numbers, names, + − * / **, comparisons, and abs, min and max of two values.
 import ast
 import difflib
 import operator
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -66,7 +67,8 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
         value = _compiled(ast.parse(text.strip(), mode="eval").body, names, condition)
     except (ValueError, SyntaxError, OverflowError, RecursionError, MemoryError):
         like = "a comparison, as 'error > 1e-3'" if condition else "a value, as 'settling + 0.1*peak_effort'"
-        raise InputError(f"'{text:.100}' is not {like}") from None
+        units = "; leave units out" if re.search(r"\d\s*(%|(?!e[-+]?\d)[^\W\d])", text) else ""
+        raise InputError(f"'{text:.100}' is not {like}{units}") from None
     if not names:
         raise InputError(f"'{text:.100}' has no number of a run; there are: {', '.join(known)}")
     for name in names:
