@@ -106,8 +106,9 @@ def held(x_des, xd_des=(0.0, 0.0), xdd_des=(0.0, 0.0), Kp=(50.0, 50.0), Kd=(40.0
     return Held(x_des, xd_des, xdd_des, Kp, Kd)
 
 
-def test_held_inputs_from_rest_give_the_textbook_solution() -> None:
-    step, steps = 0.01, 500
+@pytest.mark.parametrize("step", [0.01, 1])
+def test_held_inputs_from_rest_give_the_textbook_solution(step: float) -> None:
+    steps = 500
     error = task_error((0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], step, np.arange(steps + 1))
     expected = oracles.task_error(np.array([0.03, 0.13]), 50.0, 40.0, step * np.arange(steps + 1))
     np.testing.assert_allclose(error, expected, rtol=0.0, atol=1e-15)

@@ -122,6 +122,15 @@ def test_what_cannot_be_exported_is_refused(name, message, bag_path, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
+def test_an_export_does_not_replace_a_file_of_its_bag(bag_path, tmp_path):
+    (tmp_path / "link").symlink_to(bag_path)
+    before = {file: file.read_bytes() for file in bag_path.iterdir()}
+    for folder in (bag_path, tmp_path / "link"):
+        with pytest.raises(twodof.TwoDofError, match=r"is in the bag, whose files are not replaced"):
+            twodof.export_bag(bag_path, folder / f"{bag_path.name}.mcap")
+    assert before == {file: file.read_bytes() for file in bag_path.iterdir()}
+
+
 def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path, tmp_path):
     """A robot at rest too, whose messages compress a thousandfold."""
     for name, step in {"moving": 0.01, "resting": 0.001}.items():

@@ -14,6 +14,7 @@ from motions import assert_true, bag_of, move, mujoco_model, noisy
 import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
+from twodof.identification import stretches
 
 ARM = Path(__file__).parents[1] / "urdf" / "2dof.urdf"
 GRAVITY = (0.0, -9.81, 0.0)
@@ -71,6 +72,22 @@ def test_the_command_writes_a_folder_whose_robot_moves_as_recorded(bag, tmp_path
 
 def test_hidden_values_are_found(bag):
     assert_true(twodof.fit(ARM, bag, FREE, gravity=GRAVITY), TRUTH)
+
+
+def test_of_a_long_recording_evenly_spread_parts_are_used(bag, monkeypatch, caplog):
+    for name, value in (("MOST_FITTED", 1500), ("MOST_HELD", 300), ("PIECE", 400)):
+        monkeypatch.setattr(stretches, name, value)
+    result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)
+    assert "samples for the fit, 1500 are used, evenly spread in pieces" in caplog.text
+    for limit, curves in (
+        (1500, [c for c in result.curves if not c.measured.size]),
+        (300, [c for c in result.curves if c.measured.size]),
+    ):
+        assert 0.95 * limit < sum(len(c.t) for c in curves) <= limit
+        begins = np.diff([c.t[0] for c in curves])
+        assert np.ptp(begins) < 0.1 and begins.mean() > 2.0
+    for p in result.parameters:
+        assert abs(p.after - TRUTH[p.name]) <= 4.0 * p.deviation
 
 
 def test_only_numbers_of_the_urdf_change(bag):

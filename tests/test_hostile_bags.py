@@ -166,6 +166,7 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
         f"{ENDLESS} INSERT INTO topics SELECT i + 9, 't' || i, 'x', 'cdr', '', '' FROM r LIMIT 100000"
     ),
     "a message of 300 MB in a database": with_sql("UPDATE messages SET data = zeroblob(300000000) WHERE id = 1"),
+    "16 messages of 50 MB in a database": with_sql("UPDATE messages SET data = zeroblob(50000000) WHERE id < 17"),
     "laughing metadata": instead(
         "metadata.yaml",
         written(

@@ -144,6 +144,16 @@ def test_a_disk_that_is_full_leaves_the_old_file(disk):
     assert path.read_bytes() == OLD and [*path.parent.iterdir()] == [path]
 
 
+@pytest.mark.parametrize("verb", ["run", "sweep", "layouts", "fit robot.urdf bag"])
+def test_a_folder_is_no_standard_output(verb, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, words in (("-", "it is a folder"), ("", "it is empty")):
+        with pytest.raises(SystemExit):
+            main([*verb.split(), "-o", name])
+        assert words in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory, native_path):
     folder = tmp_path_factory.mktemp("outputs")

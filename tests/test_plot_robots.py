@@ -21,7 +21,8 @@ import twodof
 from twodof.bag.provenance import Provenance
 from twodof.errors import PlotError, TwoDofError
 from twodof.pages.replay import replay
-from twodof.plots.runs import plot
+from twodof.plots.figure import save
+from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
 
 ARM = Path(__file__).parents[1] / "urdf/2dof.urdf"
@@ -320,6 +321,14 @@ def test_a_joint_at_infinity_is_nowhere(tmp_path):
     np.testing.assert_array_equal(np.isnan(track.motion.path).any(axis=1).nonzero()[0], [3, 4, 5])
     plot(bag, urdf=tmp_path / "arm.urdf")
     replay(bag, urdf=tmp_path / "arm.urdf")
+
+
+def test_more_joints_than_a_figure_can_show_are_refused(tmp_path):
+    t, q, v = waves(150)
+    bag = third_party_bag(tmp_path / "bag", [f"j{i}" for i in range(150)], t, q, v)
+    with pytest.raises(PlotError, match=r"150 joints are too many for a figure, which shows 128"):
+        plot(bag)
+    assert save(drawing(read_tracks([bag])), tmp_path / "all.html").exists()
 
 
 UNSOUND: dict[str, Callable[[dict[str, Any]], Any]] = {

@@ -200,6 +200,7 @@ HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
     "a run twice": lambda table: changed(table, "run", pa.array([1, 1])),
     "text for numbers": lambda table: changed(table, "settling_time", pa.array(["a", "b"])),
     "not finite": lambda table: changed(table, "Kp", pa.array([1.0, np.inf])),
+    "numbers whose difference overflows": lambda table: changed(table, "overshoot", pa.array([1e308, -1e308])),
     "no design": lambda table: described(table, "design", []),
     "no FMU": lambda table: described(table, "fmu", {}),
     "a long number": lambda table: described(table, "options", {"stop_time": 10**400, "step": 1, "settings": {}}),

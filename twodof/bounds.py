@@ -1,6 +1,7 @@
 """Limits on untrusted files: sizes in bytes, processor times in s; those of URDFs are in ``plant/urdf.py``."""
 
 KIB, MIB = 1024, 1024**2
+MAX_NUMBER = 1e300  # in a sweep: differences of larger numbers overflow
 
 # zip archives
 MAX_ARCHIVE = 2048 * MIB
@@ -62,5 +63,6 @@ MAX_DEFINITION = 64 * KIB  # a message type
 MAX_RUNS = 1_000_000
 MAX_SWEEP = 512 * MIB  # the table in memory: a million runs, each with a message
 
-# pages
+# figures and pages
+MAX_PANELS = 256  # of a figure; Matplotlib takes 0.1 s for one
 MAX_HEAD = 64 * KIB  # beginning of a file that identifies a page

@@ -41,6 +41,8 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     path = path_of(output, "export")
     if path.suffix not in ENDINGS:
         raise BagError(f"'{path}': the name of an export ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if path.resolve().parent in [each.resolve() for each in bags]:
+        raise BagError(f"'{path}' is in the bag, whose files are not replaced; give another `output`")
     if path.suffix == ".lerobot":
         write_dataset([*map(read_bag, bags)], path)
         return path

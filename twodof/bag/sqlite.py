@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bounds import MAX_TOPICS
+from ..bounds import MAX_TOPICS, MIB
 from ..files import temporary_folder
 from .records import Batch, Channel, DamageError
 
@@ -23,7 +23,7 @@ TABLES = {  # ROS 2's tables and their columns; older versions lack the last one
     "messages": "id topic_id timestamp data",
 }
 SCHEMA_STEPS = 1000  # instructions of SQLite's virtual machine
-SOME = 1000  # rows in a group
+SOME, SOME_BYTES = 1000, 16 * MIB  # rows in a group, and their size from which it ends
 
 
 def sqlite3_messages(path: Path) -> Iterator[Batch]:
@@ -34,11 +34,15 @@ def sqlite3_messages(path: Path) -> Iterator[Batch]:
             rows, failure = _rows(path, database, "messages"), None
             while failure is None:
                 waiting: dict[int, list[tuple[int, bytes]]] = {}
+                size = 0
                 try:
                     for _, topic, stamp, data in islice(rows, SOME):
                         if not isinstance(stamp, int) or stamp < 0 or not isinstance(data, bytes):
                             raise DamageError(f"'{path.name}' is damaged")
                         waiting.setdefault(topic, []).append((stamp, data))
+                        size += len(data)
+                        if size > SOME_BYTES:
+                            break
                 except (sqlite3.Error, DamageError) as error:
                     failure = error  # raised after the rows read before
                 for topic, messages in waiting.items():

@@ -4,7 +4,7 @@ import argparse
 
 from .fmus import chosen_fmu
 from .help import Parser
-from .options import add_fmu, add_options
+from .options import add_fmu, add_options, folder
 from .printing import print_next, print_table, quote
 
 
@@ -17,7 +17,7 @@ def add(layouts: Parser) -> None:
     add_fmu(layouts, "TwoDof.fmu, built if it is missing")
     add_options(layouts, "--frame")
     text = "folder of the layout files (%(default)s)"
-    layouts.add_argument("-o", dest="folder", default=".", metavar="FOLDER", help=text)
+    layouts.add_argument("-o", dest="folder", type=folder, default=".", metavar="FOLDER", help=text)
     add_options(layouts, "--namespace")
     layouts.add_argument("--overwrite", action="store_true", help="replace existing files that differ")
     layouts.set_defaults(native=False)

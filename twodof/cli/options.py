@@ -27,6 +27,13 @@ def not_empty(text: str) -> str:
     return text
 
 
+def folder(text: str) -> str:
+    """Return the path of an output folder, which cannot be the standard output."""
+    if text == "-":
+        raise argparse.ArgumentTypeError("it is a folder, and cannot be the standard output; ./- is a folder named '-'")
+    return not_empty(text)
+
+
 STANDARD_OUTPUT = "/dev/stdout"
 
 
@@ -103,7 +110,7 @@ def add_fmu(parser: Parser, default: str, metavar: str = "FMU|URDF") -> None:
     parser.add_argument("fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}")
 
 
-def add_output(parser: Parser, metavar: str, text: str, kind: Callable[[str], str] = not_empty) -> None:
+def add_output(parser: Parser, metavar: str, text: str, kind: Callable[[str], str] = folder) -> None:
     """Add the option for the output: a folder, or of kind ``output_file`` a file."""
     parser.add_argument("-o", dest="output", type=kind, metavar=metavar, help=text)
 

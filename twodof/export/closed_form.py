@@ -106,7 +106,7 @@ def task_error(
     with np.errstate(over="ignore", invalid="ignore"):  # with negative gains, the solution overflows
         for (k, held), end in zip(schedule, ends):
             here = slice(*np.searchsorted(steps, (k, end), side="right"))
-            t = (np.append(steps[here], end) - k) * step  # the last time is the start of the next part
+            t = (np.append(steps[here], end) - k) * float(step)  # the last time is the start of the next part
             gains = {*zip(held.Kp, held.Kd)}
             solved = {each: responses(t, *each) for each in gains}
             for i, (x_des, xd_des, xdd_des, Kp, Kd) in enumerate(zip(*held)):

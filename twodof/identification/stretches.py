@@ -7,6 +7,7 @@ derivatives.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from ..errors import InputError, choice
 from ..plant.robot import Robot
 
 Array = NDArray[np.float64]
+LOG = logging.getLogger(__name__)
 
 BAND, MOST_BAND, LEAST_BAND = 0.1, 20.0, 2.0
 """Band of the fit: fraction of the sampling rate, and upper and lower bound in Hz."""
@@ -34,6 +36,9 @@ MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint 
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
 MIXED = 0.03  # second difference of positions between close samples, as part of their range, that shows mixed samples
+MOST_FITTED, MOST_HELD = 100_000, 6000
+"""Samples that are fitted, and that are held out and simulated; of longer recordings, evenly spread parts are used."""
+PIECE = 20_000  # samples whose regressors are in memory together
 MOST_KURTOSIS, MOST_BEND = 30.0, 5.0
 """Second differences of efforts that show jumps: kurtosis (of noise 0, of a few jumps over 100), and largest one in
 standard deviations of the effort. A reversal of friction alone gives at most 2.
@@ -115,7 +120,20 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
     for i, joint in enumerate(robot.joints):
         if not any(stretch.moving[:, i].sum() * stretch.step >= 0.5 for stretch in fitted):
             raise InputError(f"joint '{joint}' never moves in the recordings: lock it with `lock`, or record it moving")
-    return fitted, held
+    return _thinned(fitted, MOST_FITTED, "for the fit"), _thinned(held, MOST_HELD, "held out")
+
+
+def _thinned(whole: Sequence[Stretch], most: int, purpose: str) -> list[Stretch]:
+    """Return the stretches in pieces; of more samples than ``most``, the beginning of each piece."""
+    samples, pieces = sum(len(stretch.t) for stretch in whole), []
+    if samples > most:
+        LOG.warning(f"of {samples} samples {purpose}, {most} are used, evenly spread in pieces")
+    for stretch in whole:
+        cuts = np.linspace(0, len(stretch.t), -(-len(stretch.t) // PIECE) + 1).astype(int).tolist()
+        for begin, end in pairwise(cuts):
+            used = min(end - begin, max(2, (end - begin) * most // samples))
+            pieces.append(stretch.part(slice(begin, begin + used)))
+    return pieces
 
 
 def jumps(recordings: Sequence[Recording], robot: Robot) -> dict[str, float]:

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from ..bag.provenance import each_robot
 from ..bag.recording import Recording
-from ..errors import path_of
+from ..bounds import MAX_PANELS
+from ..errors import PlotError, path_of
 from .figure import Drawing, draw_head, drawn
 from .interactive import body
 from .panels import HELD, KINDS, TARGET, UNITS, Panel, duration, joint_names, panels_of, title
@@ -79,6 +80,9 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     error = panels.pop() if panels[-1].kind == "error" else None
     kinds = len({panel.kind for panel in panels})
     joints = len(panels) // kinds
+    if len(panels) > MAX_PANELS:
+        remedy = "name some `joints`, or write a page (.html), which shows all"
+        raise PlotError(f"{joints} joints are too many for a figure, which shows {MAX_PANELS // kinds}: {remedy}")
     across, blocks, rows = kinds, ceil(joints / ROWS), ceil(joints / ceil(joints / ROWS))
     width = blocks * (NAMES + kinds * PANEL[kinds])
     if joints == 1:

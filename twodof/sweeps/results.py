@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_RUNS, MAX_SWEEP
+from ..bounds import MAX_NUMBER, MAX_RUNS, MAX_SWEEP
 from ..errors import SweepError, no_such
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
@@ -287,7 +287,7 @@ def _check_values(file: Path, table: pa.Table, count: int) -> None:
     if len(table) and not (
         len(runs.unique()) == len(runs)
         and 0 <= pc.min(runs).as_py() <= pc.max(runs).as_py() < count
-        and all(pc.all(pc.is_finite(column), min_count=0).as_py() for column in numbers)
+        and all(pc.all(pc.less(pc.abs(column), MAX_NUMBER), min_count=0).as_py() for column in numbers)
     ):
         raise _damaged(file)
 
