@@ -248,7 +248,7 @@ def _load(judge: Judge) -> Iterator[Cause]:
     heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
     each = heavy or [name for name in usual if usual[name] > 0.0]
     which = "all joints" if len(each) == len(usual) > 2 else f"joints {', '.join(map(repr, each))}"
-    kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.2)
+    kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.0)
     if each:
         yield Cause(kind, f"the controller does not know the damping of {which}{tail}", share)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
