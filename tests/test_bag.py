@@ -382,7 +382,8 @@ def test_what_is_no_bag_is_refused(tmp_path, content):
 def test_definitions_are_those_of_humble():
     from twodof.ros.messages import DEFINITIONS, store_of
 
-    for name in reversed(DEFINITIONS):  # what is made of others first
+    foreign = [name for name in DEFINITIONS if name.startswith("pal_")]  # those of PAL are in no distribution
+    for name in reversed([name for name in DEFINITIONS if name not in foreign]):  # what is made of others first
         ours = store_of(name)
         assert ours.fielddefs[name][1] == STORE.fielddefs[name][1]
         assert ours.hash_rihs01(name) == STORE.hash_rihs01(name)
