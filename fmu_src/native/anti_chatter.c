@@ -18,7 +18,7 @@ typedef struct {
 /* The holds in a communication step. Times are in s from its start. */
 typedef struct {
     int rigid;
-    double chatter_time;
+    double chatter_time, first;               /* the latter a fraction, for joints */
     double left[N_JOINTS], slipped[N_JOINTS]; /* last release and start of slip of each joint */
     double risen, risen_v[N_JOINTS];          /* last rise of the rank, and the velocities then */
     Hold joints, rank, stuck[N_JOINTS];
@@ -32,6 +32,7 @@ static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
     memset(chatter, 0, sizeof *chatter);
     chatter->rigid = plant->value[RIGID_STOPS] != 0.0;
     chatter->chatter_time = CHATTER_TIME * plant->value[MAX_STEP];
+    chatter->first = chatter->rigid ? fmax(SHORT_CHATTER_TIME * coarseness(plant), FIRST_HOLD) : FIRST_HOLD;
     chatter->risen = -HUGE_VAL;
     chatter->joints = chatter->rank = none;
     for (int i = 0; i < N_JOINTS; i++) {
@@ -72,7 +73,7 @@ static double hold_joints(AntiChatter *chatter, const Step *step, double t, doub
     for (int i = 0; i < N_JOINTS; i++)
         any |= chatter->chattering[i];
     if (any)
-        hold_for_a_while(&chatter->joints, t, chatter->soon, chatter->longest, chatter->rigid ? SHORT_CHATTER_TIME : FIRST_HOLD);
+        hold_for_a_while(&chatter->joints, t, chatter->soon, chatter->longest, chatter->first);
     const int all = any && chatter->joints.length >= HOLD_OF_ALL * chatter->chatter_time;
     for (int i = 0; i < N_JOINTS && (any || !(chatter->joints.until > t)); i++)
         chatter->joints_held[i] = all ? is_at_limit(step, i) : chatter->chattering[i];

@@ -17,6 +17,7 @@
 enum { MOST_PIVOTS = 10000, BLOCK_TRIES = 5 };
 /* 2⁻⁴⁰: rounding error of a sum whose sign decides, relative to its terms. */
 static const double ROUNDING_OF_SUM = 1.0 / 1099511627776.0;
+static const double USUAL_RTOL = 1e-3;
 
 #ifndef IS_COMPLEX
 /* A joint at a limit or at rest. */
@@ -107,6 +108,11 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
     for (int i = 0; i < N_JOINTS; i++)
         rate[i] = free[i] == 0.0 ? 0.0 : rate[i] + change[i];
     return !bounded || (finite && (!any || count == 0));
+}
+
+double coarseness(const Plant *plant)
+{
+    return fmin(1.0, plant->value[RTOL] / USUAL_RTOL);
 }
 
 int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])

@@ -24,6 +24,9 @@ typedef struct {
    rocking block. Returns whether a velocity pointed into a limit. */
 INTERNAL int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS]);
 
+/* Fraction of the times within which events at rigid stops are one: they shrink with rtol below its default. */
+INTERNAL double coarseness(const Plant *plant);
+
 /* Find the regime at y after an impact, with the given rank of J⁺. a receives q̈ in this regime, effort the result of
    restrain, margin that of acceleration. Resting joints in kept stay at rest even if the holding effort exceeds its
    bounds. Joints whose motion friction or a rigid stop ends within a window, s, stop at once: the window is that of an

@@ -31,9 +31,10 @@ TIME_RESOLUTION, RELEASE_RESOLUTION = 2.0**-52, 2.0**-26
 """Resolution of the time of an event, as a fraction of the step. At a release the acceleration is 0, so that the error
 of the state grows with the square of that of the time.
 """
-TOGETHER, WINDOW = 2.0**-25, 2.0**-13
+TOGETHER, WINDOW, USUAL_RTOL = 2.0**-25, 2.0**-13, 1e-3
 """Fractions of the largest step. Joints that reach rigid stops within the first of an event stop with it. Joints
-that an impact moves, and that come to rest within the second, stop with the impact.
+that an impact moves, and that come to rest within the second, stop with the impact. Below USUAL_RTOL, the second
+shrinks with rtol, as the first hold at a rigid stop does.
 """
 THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
 

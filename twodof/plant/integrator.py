@@ -64,6 +64,7 @@ class _Motion:
         self._buffer, self._q, self._v = state.data, state[:n], state[n:]
         self.n, self.evaluations = n, 0
         self.stops, self.rtol, self.atol, self.max_step = stops, rtol, atol, max_step
+        self.coarseness = min(1.0, rtol / events.USUAL_RTOL)
         self._damping = np.array(equations.damping) if len(equations.damping) else np.zeros(n)
         self._automatic = integrator == AUTOMATIC and bool(len(equations.damping))
         self._stiff = integrator == STIFF
@@ -85,7 +86,7 @@ class _Motion:
         hits = self.stops.impact(y, anti_chatter) and self.stops.rigid
         self.stops.slide(y[self.n :])
         a, self.rank, margin = self._acceleration(y, rank)
-        if hits and self.stops.stop_within(events.WINDOW * self.max_step, y, a, kept):
+        if hits and self.stops.stop_within(events.WINDOW * self.max_step * self.coarseness, y, a, kept):
             self.stops.slide(y[self.n :])
             a, self.rank, margin = self._acceleration(y, rank)
         self.grips, self.margins = [self.stops.hold(y, a, kept)], [margin]
@@ -300,13 +301,14 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     n, stops, t = motion.n, motion.stops, 0.0
     chatter_time = CHATTER_TIME * motion.max_step
     short_time = SHORT_CHATTER_TIME * chatter_time
+    first = max(SHORT_CHATTER_TIME * motion.coarseness, FIRST_HOLD) if stops.rigid else FIRST_HOLD
     joint_hold, slide, stuck = Hold(), Slide(), [Hold() for _ in range(n)]
     left, slipped = [-inf] * n, [-inf] * n  # last release and start of slip
     soon, longest = chatter_time, chatter_time  # times of the holds at limits
     chattering, anti_chatter = [False] * n, [False] * n
     while t < h:
         if any(chattering):
-            joint_hold.again(t, soon, longest, SHORT_CHATTER_TIME if stops.rigid else FIRST_HOLD)
+            joint_hold.again(t, soon, longest, first)
             anti_chatter = chattering
             if joint_hold.length >= HOLD_OF_ALL * chatter_time:
                 anti_chatter = stops.at_limits(y)
