@@ -4,6 +4,7 @@
 #include "fmu.c"
 
 static const double NO_ARMATURE[N_JOINTS] = {0};
+static const double NO_CENTRE[3] = {0};
 
 FMI2_Export void probe_task(const double q[], const double v[], double x[], double J[],
                             double drift[])
@@ -45,7 +46,7 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
     JointPosition joint[N_BODIES];
     EndBody end_body;
     place_joints(q, joint);
-    load_end_body(0.0, v, &end_body);
+    load_end_body(0.0, NO_CENTRE, &end_body);
     inverse_dynamics(joint, &end_body, NO_ARMATURE, v, a, gravity, tau);
 }
 
@@ -55,7 +56,7 @@ FMI2_Export void probe_effort_bounds(const double q[], const double v[], const d
     JointPosition joint[N_BODIES];
     EndBody end_body;
     place_joints(q, joint);
-    load_end_body(0.0, v, &end_body);
+    load_end_body(0.0, NO_CENTRE, &end_body);
     effort_bounds(joint, &end_body, NO_ARMATURE, v, a, gravity, bound);
 }
 
@@ -64,7 +65,7 @@ FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau
     JointPosition joint[N_BODIES];
     EndBody end_body;
     place_joints(q, joint);
-    load_end_body(0.0, q, &end_body);
+    load_end_body(0.0, NO_CENTRE, &end_body);
     acceleration_of_effort(joint, &end_body, NO_ARMATURE, tau, a);
 }
 
