@@ -8,6 +8,15 @@
 #include "directional.h"
 #include "instance.h"
 
+/* Derivatives of the unknowns by the given variables. */
+typedef struct {
+    Call call;
+    const Reference *unknown, *given;
+    size_t n_unknown, n_given;
+    int wants; /* computed variables that `differentiate` returns */
+    int by_product; /* the derivatives of the rates are elements of the Jacobian */
+} Request;
+
 /* Name of the first variable whose value is not finite, or NULL. */
 static const char *culprit(const Reference vr[], size_t count, const double value[])
 {
@@ -19,51 +28,37 @@ static const char *culprit(const Reference vr[], size_t count, const double valu
 }
 
 /* The computed variables that the derivatives of the unknowns need; -1, with a logged reason, if there are no such
-   derivatives, or if the seed, of the unknowns or of the given variables, is not finite. */
-static int wanted(Instance *instance, Call call, const Reference unknown[], size_t n_unknown,
-                  const Reference given[], size_t n_given, const double seed[])
+   derivatives. */
+static int wanted(Instance *instance, const Request *request)
 {
-    const int adjoint = call == GET_ADJOINT_DERIVATIVE;
-    const char *name = adjoint ? culprit(unknown, n_unknown, seed) : culprit(given, n_given, seed);
-    if (name) {
-        report(instance, ERROR, "%s: the %s of %s is not finite", call_name(call), adjoint ? "weight" : "change", name);
-        return -1;
-    }
     int wants = 0;
-    for (size_t i = 0; i < n_unknown; i++) {
-        const int k = INDEX[unknown[i]];
+    for (size_t i = 0; i < request->n_unknown; i++) {
+        const int k = INDEX[request->unknown[i]];
         if (k < FIRST_OUTPUT || k >= END_OF_RATES) {
-            report(instance, ERROR, "%s: %s is not computed, it has no derivative", call_name(call),
+            report(instance, ERROR, "%s: %s is not computed, it has no derivative", call_name(request->call),
                    VARIABLE_NAME[k]);
             return -1;
         }
         wants |= k >= DER_Q ? WANTS_RATES : k >= Q_MEAS ? WANTS_SAMPLE : k >= TAU ? WANTS_TAU : k >= X ? WANTS_X
                                                                                              : WANTS_STATE;
     }
-    for (size_t i = 0; i < n_given; i++)
-        if (INDEX[given[i]] >= X) {
-            report(instance, ERROR, "%s: %s is neither a state nor an input", call_name(call),
-                   VARIABLE_NAME[INDEX[given[i]]]);
+    for (size_t i = 0; i < request->n_given; i++)
+        if (INDEX[request->given[i]] >= X) {
+            report(instance, ERROR, "%s: %s is neither a state nor an input", call_name(request->call),
+                   VARIABLE_NAME[INDEX[request->given[i]]]);
             return -1;
         }
-    if (!instance->state.initialised && initialise(instance, 0) != OK)
-        return -1;
-    if (!update_held(instance)) {
-        refuse(instance, call, NO_EFFORT);
-        return -1;
-    }
-    update_stops(&instance->state);
     return wants;
 }
 
-/* True if the derivatives of the rates are elements of the Jacobian, which is computed if it is worth it, or if there are
-   reactions. */
-static int has_slopes(Instance *instance, int several, const Reference given[], size_t n_given)
+/* True if the derivatives of the rates are elements of the Jacobian, which is computed if it is worth it, or if there
+   are reactions. */
+static int has_slopes(Instance *instance, int several, const Request *request)
 {
     State *state = &instance->state;
     const int reactions = any_reacts(&state->stops);
-    for (size_t i = 0; i < n_given && COMMANDS_ACCELERATION && !reactions; i++)
-        if (INDEX[given[i]] < TAU_EXT)
+    for (size_t i = 0; i < request->n_given && COMMANDS_ACCELERATION && !reactions; i++)
+        if (INDEX[request->given[i]] < TAU_EXT)
             return 0;
     if (!(state->has_rates & SLOPES)) {
         several |= state->has_rates & DIRECTION;
@@ -78,33 +73,60 @@ static int has_slopes(Instance *instance, int several, const Reference given[], 
     return state->has_rates & SLOPES;
 }
 
+/* Check a request and the values of its variables, one of which is the seed, and bring the state up to date. NULL, with
+   a logged reason, if there are no such derivatives or the seed is not finite. */
+static Instance *prepare(void *component, Request *request, const double of_unknown[], size_t n_of_unknown,
+                         const double of_given[], size_t n_of_given)
+{
+    const Call call = request->call;
+    const int adjoint = call == GET_ADJOINT_DERIVATIVE;
+    Instance *instance = enter(component, call, 1);
+    if (!instance || !known(instance, call, REAL, request->unknown, request->n_unknown, of_unknown, n_of_unknown)
+        || !known(instance, call, REAL, request->given, request->n_given, of_given, n_of_given))
+        return NULL;
+    const char *name = adjoint ? culprit(request->unknown, request->n_unknown, of_unknown)
+                               : culprit(request->given, request->n_given, of_given);
+    if (name) {
+        report(instance, ERROR, "%s: the %s of %s is not finite", call_name(call), adjoint ? "weight" : "change", name);
+        return NULL;
+    }
+    if ((request->wants = wanted(instance, request)) < 0)
+        return NULL;
+    if (!instance->state.initialised && initialise(instance, 0) != OK)
+        return NULL;
+    if (!update_held(instance)) {
+        refuse(instance, call, NO_EFFORT);
+        return NULL;
+    }
+    update_stops(&instance->state);
+    const int several = adjoint && n_of_given > 1;
+    request->by_product = (request->wants & WANTS_RATES) && has_slopes(instance, several, request);
+    if (request->by_product)
+        request->wants -= WANTS_RATES;
+    return instance;
+}
+
 /* The change of the unknowns if the knowns (states and inputs) change by the seed. */
 static Status directional_derivative(void *component, const Reference unknown[], size_t n_unknown,
                                      const Reference given[], size_t n_given, const double seed[],
                                      size_t n_seed, double result[], size_t n_result)
 {
-    const Call call = GET_DIRECTIONAL_DERIVATIVE;
-    Instance *instance = enter(component, call, 1);
-    double derivative[FIRST_PARAMETER];
-    if (!instance || !known(instance, call, REAL, unknown, n_unknown, result, n_result)
-        || !known(instance, call, REAL, given, n_given, seed, n_seed))
-        return ERROR;
-    int wants = wanted(instance, call, unknown, n_unknown, given, n_given, seed);
-    if (wants < 0)
+    Request request = {GET_DIRECTIONAL_DERIVATIVE, unknown, given, n_unknown, n_given, 0, 0};
+    Instance *instance = prepare(component, &request, result, n_result, seed, n_seed);
+    if (!instance)
         return ERROR;
     const Stops *stops = &instance->state.stops;
-    const int by_product = (wants & WANTS_RATES) && has_slopes(instance, 0, given, n_given);
-    if (by_product)
-        wants -= WANTS_RATES;
+    double derivative[FIRST_PARAMETER];
     const double *next = seed;
-    if (wants) {
+    if (request.wants) {
         double change[X] = {0};
         for (size_t i = 0; i < n_given; i++)
             for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++)
                 change[k] += *next++;
-        differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants, change, derivative);
+        differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, request.wants, change,
+                      derivative);
     }
-    if (by_product) {
+    if (request.by_product) {
         double *rate = &derivative[DER_Q];
         memset(rate, 0, N_STATES * sizeof *rate);
         next = seed;
@@ -119,7 +141,7 @@ static Status directional_derivative(void *component, const Reference unknown[],
             zero += 0.0 * (*result++ = derivative[k]);
     if (zero == 0.0)
         return OK;
-    return report(instance, DISCARD, "%s: that of %s is not finite", call_name(call),
+    return report(instance, DISCARD, "%s: that of %s is not finite", call_name(request.call),
                   culprit(unknown, n_unknown, result - n_result));
 }
 
@@ -129,19 +151,12 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
                                 const Reference given[], size_t n_given, const double seed[],
                                 size_t n_seed, double result[], size_t n_result)
 {
-    const Call call = GET_ADJOINT_DERIVATIVE;
-    Instance *instance = enter(component, call, 1);
-    double weight[FIRST_PARAMETER] = {0}, sum[FIRST_PARAMETER] = {0};
-    if (!instance || !known(instance, call, REAL, unknown, n_unknown, seed, n_seed)
-        || !known(instance, call, REAL, given, n_given, result, n_result))
-        return ERROR;
-    int wants = wanted(instance, call, unknown, n_unknown, given, n_given, seed);
-    if (wants < 0)
+    Request request = {GET_ADJOINT_DERIVATIVE, unknown, given, n_unknown, n_given, 0, 0};
+    Instance *instance = prepare(component, &request, seed, n_seed, result, n_result);
+    if (!instance)
         return ERROR;
     const Stops *stops = &instance->state.stops;
-    const int by_product = (wants & WANTS_RATES) && has_slopes(instance, n_result > 1, given, n_given);
-    if (by_product)
-        wants -= WANTS_RATES;
+    double weight[FIRST_PARAMETER] = {0}, sum[FIRST_PARAMETER] = {0};
     for (size_t i = 0; i < n_unknown; i++)
         for (int k = INDEX[unknown[i]]; k < INDEX[unknown[i] + 1]; k++)
             weight[k] += *seed++;
@@ -149,15 +164,16 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
         for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++) {
             double change[X] = {0}, derivative[FIRST_PARAMETER];
             change[k] = 1.0;
-            if (wants)
-                differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants, change,
-                              derivative);
+            if (request.wants)
+                differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, request.wants,
+                              change, derivative);
             sum[k] = 0.0;
             for (int u = FIRST_OUTPUT; u < END_OF_RATES; u++)
                 if (weight[u] != 0.0)
-                    sum[k] += weight[u] * (by_product && u >= DER_Q ? instance->slope[u - DER_Q][k] : derivative[u]);
+                    sum[k] += weight[u] * (request.by_product && u >= DER_Q ? instance->slope[u - DER_Q][k]
+                                                                            : derivative[u]);
             if (!isfinite(sum[k]))
-                return report(instance, DISCARD, "%s: that by %s is not finite", call_name(call),
+                return report(instance, DISCARD, "%s: that by %s is not finite", call_name(request.call),
                               VARIABLE_NAME[k]);
         }
     for (size_t i = 0; i < n_given; result += size_of(given[i++]))

@@ -12,25 +12,28 @@ IEEE Transactions on Robotics and Automation 13(5), 1997.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import differential_evolution
 
 from ..errors import InputError
-from ..export.urdf_source import read_text
 from ..files import refusing, write_file
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
+from ..signatures import with_keywords_of
 from .curves import efforts
 from .estimate import DELAY_SCALE, FIRST_NOISE, PRIOR, information_root, typical
-from .fitting import GRAVITY, check_gravity, read_robot
+from .fitting import GRAVITY, ModelOptions, read_model
 from .parameters import Parameters
 from .regression import Rows, position_derivatives, regressors
 from .stretches import Array, Stretch
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 SHORTEST, LONGEST = 5.0, 120.0  # s
 HARMONICS, HIGHEST = 6, 1.0
@@ -166,16 +169,15 @@ class _Design:
         return float(0.5 * np.linalg.slogdet(covariance)[1] / len(covariance))
 
 
+@with_keywords_of(read_model)
 def excite(
     urdf: str | Path,
     seconds: float,
     free: str | Sequence[str],
     *,
     output: str | Path | None = None,
-    frame: str | None = None,
-    lock: Mapping[str, float] | None = None,
-    gravity: Sequence[float] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **options: Unpack[ModelOptions],
 ) -> Excitation:
     """Return a motion whose recording tells most about free parameters, within the limits of the URDF.
 
@@ -191,13 +193,11 @@ def excite(
             robot, or the file cannot be written.
         BuildError: the URDF cannot be read.
     """
-    check_gravity(gravity)
     if not SHORTEST <= seconds <= LONGEST:
         raise InputError(f"a motion of {seconds:g} s is not possible: between {SHORTEST:g} and {LONGEST:g} s")
-    path, patterns = Path(urdf), [free] if isinstance(free, str) else free
-    _, locked, robot = read_robot(path.name, read_text(path, None), frame, lock or {}, patterns)
-    parameters = Parameters(locked, robot, patterns, gravity or GRAVITY)
-    known = locked.joints.values()
+    model = read_model(urdf, free, **options)
+    parameters, robot = model.parameters(options.get("gravity") or GRAVITY), model.robot
+    known = model.locked.joints.values()
     own = [[j.velocity / abs(j.ratio) for j in known if j.ratio and j.leader == name] for name in robot.joints]
     design = _Design(robot, [min(each) for each in own], parameters, seconds)
     rng = np.random.default_rng(0)

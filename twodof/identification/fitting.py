@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, count
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from ..export.urdf_source import end_effector, last_links, lock_joints, read_tex
 from ..files import shown
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, Urdf, read_urdf
+from ..signatures import with_keywords_of
 from .commanded import commanded_efforts
 from .curves import Comparison, compare
 from .estimate import PASSES, Estimate, estimate
@@ -25,6 +27,9 @@ from .parameters import Dynamics, Parameters
 from .regression import regressors
 from .stretches import Array, Stretch, jumps, stretches
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 WRONG_UNITS = 300.0
 """Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
 NORMAL_95 = 1.959964
@@ -32,16 +37,63 @@ POSITIVE = ("friction", "damping", "armature", "payload", "mass")
 GRAVITY = (0.0, 0.0, -9.81)
 
 
+class ModelOptions(TypedDict, total=False):
+    """Keywords of ``read_model``."""
+
+    frame: str | None
+    lock: Mapping[str, float] | None
+    gravity: Sequence[float] | None
+
+
+class Model(NamedTuple):
+    """A robot with free parameters, before a fit."""
+
+    path: Path
+    text: str
+    urdf: Urdf
+    locked: Urdf
+    """The same with fixed joints."""
+    robot: Robot
+    """Dynamics of the latter."""
+    patterns: Sequence[str]
+
+    def parameters(self, gravity: Sequence[float]) -> Parameters:
+        """Return the free parameters, with the gravity in m/s²."""
+        return Parameters(self.locked, self.robot, self.patterns, gravity)
+
+
+def read_model(
+    urdf: str | Path,
+    free: str | Sequence[str],
+    *,
+    frame: str | None = None,
+    lock: Mapping[str, float] | None = None,
+    gravity: Sequence[float] | None = None,
+) -> Model:
+    """Read a robot whose parameters matching ``free`` are free; the other arguments are those of ``fit``."""
+    if gravity is not None and not np.isfinite(gravity).all():
+        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
+    path, patterns = Path(urdf), [free] if isinstance(free, str) else free
+    text = read_text(path, None)
+    try:
+        fixed = lock_joints(text, lock or {})
+        locked = read_urdf(fixed)
+        needs_frame = any("payload" in pattern for pattern in patterns)
+        end = end_effector(locked, frame) if frame or needs_frame else [*last_links(locked), locked.root][0]
+        return Model(path, text, read_urdf(text), locked, load_robot(fixed, end, "xyz"), patterns)
+    except RobotError as error:
+        raise InputError(f"{path.name}: {error}") from error
+
+
+@with_keywords_of(read_model)
 def fit(
     urdf: str | Path,
     bags: str | Path | Sequence[str | Path],
     free: str | Sequence[str],
     *,
     output: str | Path | None = None,
-    frame: str | None = None,
-    lock: Mapping[str, float] | None = None,
-    gravity: Sequence[float] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **options: Unpack[ModelOptions],
 ) -> Fit:
     """Fit parameters of a robot to bags of its motion, with positions and efforts of its joints.
 
@@ -67,28 +119,19 @@ def fit(
     """
     if output is not None:
         check_folder(output)
-    check_gravity(gravity)
-    path, patterns = Path(urdf), [free] if isinstance(free, str) else free
-    text = read_text(path, None)
-    read, locked, robot = read_robot(path.name, text, frame, lock or {}, patterns)
+    model = read_model(urdf, free, **options)
     recordings = _recordings(bags)
-    parameters = Parameters(locked, robot, patterns, gravity or _recorded_gravity(recordings))
-    fitted, held = stretches(recordings, robot)
+    parameters = model.parameters(options.get("gravity") or _recorded_gravity(recordings))
+    fitted, held = stretches(recordings, model.robot)
     _check_units(parameters, fitted)
     finished = _counter(progress, PASSES + 2 * len(held))
     found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
-    compared = compare(robot, models, fitted, held, finished)
-    result = _result(path, text, read, parameters, found, compared, recordings)
+    compared = compare(model.robot, models, fitted, held, finished)
+    result = _result(model, parameters, found, compared, recordings)
     if output is not None:
         result.save(output)
     return result
-
-
-def check_gravity(gravity: Sequence[float] | None) -> None:
-    """Raise InputError if the gravity is not finite."""
-    if gravity is not None and not np.isfinite(gravity).all():
-        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
 
 
 def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callable[[], None]:
@@ -101,20 +144,6 @@ def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callabl
 
     finished()
     return finished
-
-
-def read_robot(
-    name: str, text: str, frame: str | None, lock: Mapping[str, float], patterns: Sequence[str]
-) -> tuple[Urdf, Urdf, Robot]:
-    """Return the robot of a URDF, the same with fixed joints, and the dynamics of the latter."""
-    try:
-        fixed = lock_joints(text, lock)
-        locked = read_urdf(fixed)
-        needs_frame = any("payload" in pattern for pattern in patterns)
-        end = end_effector(locked, frame) if frame or needs_frame else [*last_links(locked), locked.root][0]
-        return read_urdf(text), locked, load_robot(fixed, end, "xyz")
-    except RobotError as error:
-        raise InputError(f"{name}: {error}") from error
 
 
 def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
@@ -161,19 +190,13 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
 
 
 def _result(
-    path: Path,
-    text: str,
-    urdf: Urdf,
-    parameters: Parameters,
-    found: Estimate,
-    compared: Comparison,
-    recordings: Sequence[Recording],
+    model: Model, parameters: Parameters, found: Estimate, compared: Comparison, recordings: Sequence[Recording]
 ) -> Fit:
-    robot = parameters.robot
+    robot = model.robot
     return Fit(
-        urdf=path.name,
+        urdf=model.path.name,
         bags=tuple(shown(recording.path) for recording in recordings),
-        fitted_urdf=fitted_urdf(text, urdf, parameters, found.values),
+        fitted_urdf=fitted_urdf(model.text, model.urdf, parameters, found.values),
         joints=robot.joints,
         units=tuple("m" if prismatic else "rad" for prismatic in robot.prismatic),
         parameters=tuple(_parameters(parameters, found)),
