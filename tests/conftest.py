@@ -20,6 +20,7 @@ from recordings import foreign as foreign
 from recordings import gains as gains
 from scratch import Scratch
 from tools import missing, needs
+from tools import pytest_runtest_setup as pytest_runtest_setup
 from tools import pytest_terminal_summary as pytest_terminal_summary
 
 import twodof

@@ -277,7 +277,7 @@ print(memory.growth)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.needs("linux")
 @both_storages
 def test_memory_does_not_grow_with_the_run(native_path, tmp_path, storage):
     done = python("-c", MEMORY, native_path, tmp_path / "bag", storage, cwd=Path(__file__).parent, check=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from native_models import model
-from tools import missing
+from tools import needs
 
 from twodof.errors import BuildError
 from twodof.export import compiler
@@ -78,8 +78,7 @@ def test_libraries_that_are_not_used_are_not_kept(kept):
 
 
 def given_away(path):
-    if os.geteuid():
-        missing("root")
+    needs("root")
     os.chown(path, 65534, 65534)
 
 

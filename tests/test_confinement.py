@@ -3,9 +3,7 @@
 import ctypes
 import errno
 import os
-import platform
 import socket
-import sys
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -16,10 +14,7 @@ import pytest
 
 from twodof.children import Child, confine, limit_time
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != "linux" or platform.machine() != "x86_64",
-    reason="elsewhere the limits of time and memory alone are promised",
-)
+pytestmark = pytest.mark.needs("linux64")
 MEMORY, SECONDS = 1024**3, 20
 
 

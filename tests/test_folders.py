@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from subprocess import PIPE
 
 import pytest
-from tools import missing
+from tools import needs
 
 import twodof
 from twodof.errors import FmuError
@@ -59,8 +59,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(native_p
     (tmp_path / f"{TEMPORARY}link").symlink_to(others)
     (tmp_path / f"{TEMPORARY}file").touch()
     if foreign:
-        if os.geteuid():
-            missing("root")
+        needs("root")
         (tmp_path / f"{TEMPORARY}foreign").mkdir()
         os.chown(tmp_path / f"{TEMPORARY}foreign", 12345, 12345)
     (tmp_path / "twodof").mkdir()

@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -152,7 +151,7 @@ def test_websites_but_foxgloves_own_are_refused(native_path):
             assert status(("Host", host)) == 403
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not list the owners of sockets")
+@pytest.mark.needs("linux")
 @pytest.mark.parametrize(("set_gains", "status"), [(False, b"101"), (True, b"403")])
 def test_gains_are_no_business_of_other_users(native_path, set_gains, status, monkeypatch):
     asked = ("Host", "localhost"), ("Sec-WebSocket-Protocol", "foxglove.sdk.v1"), *UPGRADE
@@ -164,7 +163,7 @@ def test_gains_are_no_business_of_other_users(native_path, set_gains, status, mo
         assert one.recv(100).split()[1] == status
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot sign segments")
+@pytest.mark.needs("linux")
 def test_the_server_behind_the_door_answers_this_process_alone(native_path):
     """All users see in the kernel's list of sockets where Foxglove's SDK listens."""
     with Foxglove(0, set_gains=True).begin(twodof.experiment(native_path)) as viewer:

@@ -28,7 +28,7 @@ print(memory.growth, summary.wall_time)
 
 
 @pytest.mark.long
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.needs("linux")
 @both_storages
 def test_a_day_has_flat_memory_and_exact_stamps(native_path, tmp_path, storage, length):
     steps = length(DAY, 60_000)

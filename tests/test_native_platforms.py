@@ -268,7 +268,7 @@ def outputs(fmu: Path, **named) -> np.ndarray:
     return np.array([result[name] for name in names])
 
 
-needs_linux = pytest.mark.skipif(host_platform() != "linux64", reason="for Linux x86-64")
+needs_linux = pytest.mark.needs("linux64")
 
 
 @needs_linux

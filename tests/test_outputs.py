@@ -51,7 +51,7 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path):
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["a", "b", "far", "file", "near"]
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root makes links of another user")
+@pytest.mark.needs("root")
 @pytest.mark.parametrize("write", [lambda path: write_file(path, NEW), lambda path: twodof.Bag(path, overwrite=True)])
 @pytest.mark.parametrize(("mode", "owner"), [(0o1777, 2), (0o1777, 1), (0o1777, 0), (0o1755, 2), (0o777, 2)])
 def test_a_link_of_another_user_in_a_shared_folder_is_not_followed(mode, owner, write, tmp_path, monkeypatch):

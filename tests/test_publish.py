@@ -358,7 +358,7 @@ print(memory.growth)
 
 
 @pytest.mark.long
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.needs("linux")
 def test_an_hour_has_flat_memory(native_path, number, listen, length):
     """Seconds without pace; in full, an hour in real time."""
     steps = length(360_000, 5_000)

@@ -3,7 +3,6 @@
 import http.client
 import os
 import socket
-import sys
 import urllib.request
 from contextlib import ExitStack
 
@@ -56,7 +55,7 @@ def test_page_answers_to_its_own_name_and_its_own_page_alone(host, own, other):
             assert answer(served.url, *rest) == 403
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not list the owners of sockets")
+@pytest.mark.needs("linux")
 @pytest.mark.parametrize(
     ("host", "asked"),
     [

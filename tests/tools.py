@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import platform
 import shutil
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     import pytest
 
 NODE = Path(__file__).with_name("node_modules")
+X86_64 = sys.platform == "linux" and platform.machine() == "x86_64"
 INSTALL = "npm install --no-package-lock --prefix tests"
 
 
@@ -28,6 +31,8 @@ class Tool(NamedTuple):
     """Commands or paths, the first that exists; the table's own name if empty."""
     remedy: str = ""
     module: str = ""
+    here: bool | None = None
+    """Whether this machine has it, of what is no program."""
 
 
 TOOLS = {
@@ -44,6 +49,8 @@ TOOLS = {
     "g++": Tool("ROS 2 networks with Fast DDS", "g++", ("g++", "c++")),
     "gcc": Tool("the engine's inner functions in C", "gcc", ("gcc", "cc", "clang")),
     "ip": Tool("separate networks", "iproute2"),
+    "linux": Tool("Linux's own rules", remedy="run on Linux", here=sys.platform == "linux"),
+    "linux64": Tool("libraries for Linux x86-64", remedy="run on Linux x86-64", here=X86_64),
     "libc-arm64": Tool("libraries for ARM", "libc6-arm64-cross", ("/usr/aarch64-linux-gnu/lib/ld-linux-aarch64.so.1",)),
     "libatomic": Tool(
         "FMUs in libcosim", "libatomic1", ("/usr/lib/x86_64-linux-gnu/libatomic.so.1", "/usr/lib64/libatomic.so.1")
@@ -58,7 +65,7 @@ TOOLS = {
     "npm": Tool("Foxglove's own client", "npm"),
     "openssl": Tool("clusters with keys", "openssl"),
     "qemu": Tool("libraries for ARM", "qemu-user", ("qemu-aarch64", "qemu-aarch64-static")),
-    "root": Tool("files of another user", names=(), remedy="run as root"),
+    "root": Tool("files of another user", remedy="run as root", here=os.geteuid() == 0),
     "strace": Tool("the order of writes to a disk", "strace"),
     "tsc": Tool("types in the pages' scripts", "node-typescript"),
     "valgrind": Tool("memory errors", "valgrind"),
@@ -71,6 +78,8 @@ TOOLS = {
 def found(name: str) -> str | None:
     """Return where a tool is, or None."""
     tool = TOOLS[name]
+    if tool.here is not None:
+        return name if tool.here else None
     if tool.module:
         return tool.module if importlib.util.find_spec(tool.module) else None
     for known in tool.names or (name,):
@@ -96,6 +105,12 @@ def missing(name: str) -> NoReturn:
     if os.environ.get("CI"):
         pytest.fail(f"tests {reason}")
     pytest.skip(reason)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Check the tools that the marks of a test name."""
+    for mark in item.iter_markers("needs"):
+        needs(*mark.args)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
