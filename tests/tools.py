@@ -32,7 +32,7 @@ class Tool(NamedTuple):
     remedy: str = ""
     module: str = ""
     here: bool | None = None
-    """Whether this machine has it, of what is no program."""
+    """Presence on this machine, of what is not a program."""
 
 
 TOOLS = {

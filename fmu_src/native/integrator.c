@@ -31,7 +31,8 @@ static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept
     const int hits = impact(step->plant, step->y, anti_chatter) && value[RIGID_STOPS] != 0.0;
     step->evaluations++;
     find_regime(step->plant, step->y, kept, rank_held ? step->stops.rank : ANY_RANK,
-                hits ? WINDOW * value[MAX_STEP] * coarseness(step->plant) : 0.0, &step->stops, step->K[0] + N_JOINTS, step->effort[0], &step->margin);
+                hits ? WINDOW * value[MAX_STEP] * coarseness(step->plant) : 0.0, &step->stops,
+                step->K[0] + N_JOINTS, step->effort[0], &step->margin);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
     step->rounding = rounding_of(&step->stops, step->effort[0]);
 }
