@@ -31,6 +31,7 @@ import twodof  # noqa: E402
 from twodof.plots.figure import drawn  # noqa: E402
 from twodof.plots.runs import plot  # noqa: E402
 from twodof.plots.sweeps import drawing  # noqa: E402
+from twodof.simulation.sampled_loop import spectral_radius  # noqa: E402
 
 LINK = 0.15  # m
 LINK_COLOURS = {"link1": (0.33, 0.40, 0.49), "link2": (0.96, 0.55, 0.14)}
@@ -261,31 +262,13 @@ def draw_sampled(folder: Path, path: Path) -> None:
         error, chatter = (rows[m].to_numpy().reshape(len(Kp), len(Kd)) for m in ("final_joint_error", "chatter"))
         drawn_errors = axes.pcolormesh(Kd, Kp, error, norm=LogNorm(1e-3, 1.0), cmap="viridis", shading="nearest")
         axes.contourf(Kd, Kp, chatter, levels=[1.0, np.inf], colors="none", hatches=["///"])
-        radius = [[sampled_radius(T, AS_IT_IS["control_delay"], p, d) for d in Kd] for p in Kp]
+        radius = [[spectral_radius(p, d, T, AS_IT_IS["control_delay"], differences=True) for d in Kd] for p in Kp]
         axes.contour(Kd, Kp, radius, levels=[1.0], colors="#d62728", linewidths=2)
         axes.set(xscale="log", yscale="log", xlabel="Kd, 1/s", title=f"{1.0 / T:g} Hz")
     all_axes[0].set_ylabel("Kp, 1/s²")
     figure.colorbar(drawn_errors, ax=all_axes, label="largest joint error after 3 s, rad")
     figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
     plt.close(figure)
-
-
-def sampled_radius(T: float, delay: float, Kp: float, Kd: float) -> float:
-    """Return the spectral radius of q̈ = τ̂ under sampled PD control with a delay; velocities are differences.
-
-    The state is q, q̇ and q of the sample before, then the efforts on their way, the latest first.
-    """
-    whole = round(delay // T + (T - delay % T < 1e-9))
-    part = delay - whole * T
-    step = np.zeros((4 + whole, 4 + whole))
-    command = np.array([-Kp - Kd / T, 0.0, Kd / T, *[0.0] * (whole + 1)])
-    oldest, next_one = np.eye(4 + whole)[3 + whole], command if whole == 0 else np.eye(4 + whole)[2 + whole]
-    rest = T - part
-    step[0] = [1.0, T, *[0.0] * (2 + whole)] + oldest * (part * rest + part**2 / 2) + next_one * rest**2 / 2
-    step[1] = [0.0, 1.0, *[0.0] * (2 + whole)] + oldest * part + next_one * rest
-    step[2, 0], step[3] = 1.0, command
-    step[4:, 3:-1] = np.eye(whole)
-    return float(np.abs(np.linalg.eigvals(step)).max())
 
 
 if __name__ == "__main__":

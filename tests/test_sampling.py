@@ -12,6 +12,7 @@ import native_models
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.optimize
 import scipy.special
 import scipy.stats
 from harness import wine
@@ -31,6 +32,7 @@ from twodof.plant.plant import Plant
 from twodof.plant.robot import load_robot
 from twodof.plant.sampling import rounded
 from twodof.plant.variables import variable_table
+from twodof.simulation.sampled_loop import spectral_radius
 
 SLIDER = """<robot name="slider">
   <link name="rail"/>
@@ -92,6 +94,21 @@ def test_a_sampled_joint_is_stable_up_to_its_closed_form(Kp, Kd, stable):
     for _ in range(2500):
         plant.step(0.01)
     assert (abs(plant.q[0]) + abs(plant.v[0]) < 0.1) == stable
+
+
+@pytest.mark.parametrize("differences", [False, True])
+@pytest.mark.parametrize("delay", [0.0, 0.0008, 0.003, 0.01, 0.023])
+def test_the_spectral_radius_of_a_sampled_loop_is_1_where_its_motion_neither_grows_nor_decays(delay, differences):
+    T, Kp = 0.01, 20.0
+    limit = scipy.optimize.brentq(lambda Kd: spectral_radius(Kp, Kd, T, delay, differences=differences) - 1.0, 10, 900)
+    for Kd, stable in ((0.97 * limit, True), (1.03 * limit, False)):
+        gains = dict(control_period=T, control_delay=delay, Kp=[Kp], Kd=[Kd], q_des=[0.0])
+        plant = slider(**gains, v_from_q=float(differences), q_min=[-1e9], q_max=[1e9])
+        states = []
+        for _ in range(500):
+            plant.step(T)
+            states.append(abs(plant.q[0]) + abs(plant.v[0]))
+        assert (max(states[-100:]) < max(states[200:300])) == stable
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT
 from .judge import AT_LIMIT, BAND, Judge
+from .sampled_loop import spectral_radius
 from .setup import Array
 
 KINDS = {
@@ -36,6 +37,7 @@ MOST = 20  # causes in a verdict
 FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
 MANY_CHANGES = 12  # changes of a target beyond which it counts as moving
 OFTEN = 0.05  # share of samples from which on a state is a cause
+UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 NEAR_SINGULAR = 0.02  # ratio of the smallest to the largest singular value
 LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
@@ -276,17 +278,15 @@ def _sampled(judge: Judge) -> Iterator[Cause]:
 
 
 def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
-    """Yield a cause if gains and their delay have a negative phase margin, even while limits hold the joints."""
+    """Yield a cause if the sampled loop is unstable, even while limits hold the joints."""
+    loop = partial(spectral_radius, period=period, delay=delay, differences=bool(judge.setup.starts.get("v_from_q")))
     for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
-        p, d = judge.given(stiff), judge.given(damp)
-        crossing = np.sqrt(0.5 * (d * d + np.sqrt(d**4 + 4.0 * p * p)))  # rad/s, of (d s + p) / s²
-        margins = np.arctan2(d * crossing, p) - crossing * (0.5 * period + delay)
-        if margins.min(initial=0.0) < 0.0:
-            i = int(margins.argmin())
-            gains = f"{stiff}[{i + 1}] = {p[i]:g} s⁻² and {damp}[{i + 1}] = {d[i]:g} s⁻¹ are too high"
-            what = f"control_period = {period:g} s and control_delay = {delay:g} s"
-            text = f"{gains} for {what}: the phase margin is {np.degrees(margins[i]):.3g}°"
-            yield Cause("sampling", text, -float(margins[i]))
+        pairs = enumerate(zip(judge.given(stiff), judge.given(damp)))
+        radius, i, p, d = max(((loop(*pair), i, *pair) for i, pair in pairs), default=(0.0, 0, 0.0, 0.0))
+        if radius > UNSTABLE:
+            gains = f"{stiff}[{i + 1}] = {p:g} s⁻² and {damp}[{i + 1}] = {d:g} s⁻¹ are too high"
+            text = f"{gains} for control_period = {period:g} s and control_delay = {delay:g} s: the loop is unstable"
+            yield Cause("sampling", f"{text}, an error grows {radius:.3g} times in a period", log(radius))
 
 
 def _sampling(judge: Judge, i: int) -> Iterator[str]:

@@ -1,0 +1,29 @@
+"""Stability of a sampled controller of a joint or a direction of the task, in closed form."""
+
+import numpy as np
+
+
+def spectral_radius(Kp: float, Kd: float, period: float, delay: float, *, differences: bool = False) -> float:
+    """Return the spectral radius of q̈ = −Kp q − Kd q̇ between periods of a sampled controller with a delay.
+
+    The loop is stable if it is less than 1; friction, limits and errors of the model are not counted. The state is q, q̇
+    and q of the sample before, then the commands on their way, the latest first. A command holds for a period
+    (zero-order hold with delay: Åström, Wittenmark, "Computer-Controlled Systems", 1997, section 2.3).
+
+    Args:
+        Kp, Kd: gains, 1/s², 1/s.
+        period, delay: of the controller, s.
+        differences: whether velocities are differences of positions.
+    """
+    whole = round(delay // period + (period - delay % period < 1e-9))
+    part = delay - whole * period
+    step = np.zeros((4 + whole, 4 + whole))
+    command = np.zeros(4 + whole)
+    command[:3] = (-Kp - Kd / period, 0.0, Kd / period) if differences else (-Kp, -Kd, 0.0)
+    oldest, next_one = np.eye(4 + whole)[3 + whole], command if whole == 0 else np.eye(4 + whole)[2 + whole]
+    rest = period - part
+    step[0] = [1.0, period, *[0.0] * (2 + whole)] + oldest * (part * rest + part**2 / 2) + next_one * rest**2 / 2
+    step[1] = [0.0, 1.0, *[0.0] * (2 + whole)] + oldest * part + next_one * rest
+    step[2, 0], step[3] = 1.0, command
+    step[4:, 3:-1] = np.eye(whole)
+    return float(np.abs(np.linalg.eigvals(step)).max())
