@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from threading import Timer
 from typing import Any
@@ -37,19 +38,20 @@ from twodof.files import is_being_written
 from twodof.simulation.experiments import Experiment
 
 MIB = 1024**2
+HERE = Path(__file__).parent
 
 
 # --- where it may be written ---
 
 
-@pytest.mark.parametrize("moment", ["remove", "open", "add_connection"])
+@pytest.mark.parametrize("moment", ["rename", "open", "add_connection"])
 def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(run, tmp_path, moment, monkeypatch):
-    """The second comes just before the first removes the old bag, opens its own, adds a topic."""
+    """The second comes just before the first renames the old bag, opens its own, adds a topic."""
     path = tmp_path / "bag"
     with twodof.Bag(path).begin(run):
         pass
     first, second = (twodof.Bag(path, overwrite=True).begin(run) for _ in range(2))
-    place, name = (shutil, "rmtree") if moment == "remove" else (BagWriter, moment)
+    place, name = (Path, "rename") if moment == "rename" else (BagWriter, moment)
     original, begun = getattr(place, name), []
 
     def begin(bag: twodof.Bag) -> None:
@@ -68,6 +70,84 @@ def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(run, tmp_path, momen
         winner.write(sample(run, k))
     winner.__exit__(None, None, None)
     assert assert_consistent(path, "mcap") == 3
+
+
+def written(run: Experiment, path: Path, samples: int, *, overwrite: bool = False) -> None:
+    with twodof.Bag(path, overwrite=overwrite).begin(run) as bag:
+        for k in range(samples):
+            bag.write(sample(run, k))
+
+
+OVERWRITE = """
+import os, signal, sys
+import twodof
+from bags import sample
+from itertools import count
+
+fmu, path, moment = sys.argv[1:]
+calls, moments = dict.fromkeys(("mkdir", "rename", "unlink", "rmdir")), count(1)
+
+def killed(name, *arguments, **named):
+    if next(moments) == int(moment):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return calls[name](*arguments, **named)
+
+run = twodof.experiment(fmu)
+for name in calls:
+    calls[name] = getattr(os, name)
+    setattr(os, name, lambda *arguments, name=name, **named: killed(name, *arguments, **named))
+with twodof.Bag(path, overwrite=True).begin(run) as bag:
+    bag.write(sample(run, 0))
+    bag.write(sample(run, 1))
+"""
+
+
+def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one(run, tmp_path):
+    """At each change of a folder; between two of them nothing is lost or won."""
+    path, left, seen = tmp_path / "bag", dict[str, int](), set[tuple[str, int]]()
+    written(run, path, 5)
+    keep = shutil.copytree(path, tmp_path / "keep")
+    for moment in count(1):
+        done = python("-c", OVERWRITE, run.fmu.path, path, str(moment), cwd=HERE)
+        left.clear()
+        for bag in tmp_path.glob("bag*"):
+            with suppress(BagError):
+                left[bag.name] = twodof.recover(bag).counts["/joint_states"]
+        assert left.get("bag") in (1, 2, 5) or left["bag.replaced"] == 5, f"after a kill at change {moment}: {left}"
+        seen |= left.items()
+        for bag in tmp_path.glob("bag*"):
+            shutil.rmtree(bag)
+        if done.returncode == 0:
+            break
+        shutil.copytree(keep, path)
+    assert seen >= {("bag", 5), ("bag.replaced", 5), ("bag", 2)}
+    assert not any(file for folder in tmp_path.iterdir() if folder != keep for file in folder.iterdir())
+
+
+def test_a_run_that_fails_before_its_first_sample_restores_the_bag_that_it_would_replace(run, tmp_path):
+    path = tmp_path / "bag"
+    written(run, path, 5)
+    with pytest.raises(ZeroDivisionError), twodof.Bag(path, overwrite=True).begin(run):
+        raise ZeroDivisionError
+    assert [*tmp_path.iterdir()] == [path] and assert_consistent(path, "mcap") == 5
+
+
+def test_a_bag_that_a_killed_run_has_renamed_is_named_and_later_removed(run, tmp_path):
+    path = tmp_path / "bag"
+    written(run, path, 5)
+    path.rename(tmp_path / "bag.replaced")
+    with pytest.raises(BagError, match=r"no bag '.*bag'; did you mean '.*bag.replaced'"):
+        twodof.read_bag(path)
+    for size in (2, 3):
+        written(run, path, size, overwrite=True)
+        assert assert_consistent(path, "mcap") == size
+    assert [*tmp_path.iterdir()] == [path]
+    notes = tmp_path / "bag.replaced" / "notes.txt"
+    notes.parent.mkdir()
+    notes.touch()
+    with pytest.raises(BagError, match=r"bag.replaced' is not a bag and is not overwritten"):
+        written(run, path, 5, overwrite=True)
+    assert notes.exists() and assert_consistent(path, "mcap") == 3
 
 
 def test_bag_is_locked_though_another_looks_whether_it_is(run, tmp_path, monkeypatch):
@@ -123,11 +203,11 @@ def test_a_link_stays_and_the_bag_behind_it_is_written(run, tmp_path, storage):
     link, path = tmp_path / "link", tmp_path / "far" / "bag"
     path.parent.mkdir()
     link.symlink_to("far/bag")
-    for count in (1, 2):
-        with twodof.Bag(link, storage=storage, overwrite=count == 2).begin(run) as bag:
-            for k in range(count):
+    for size in (1, 2):
+        with twodof.Bag(link, storage=storage, overwrite=size == 2).begin(run) as bag:
+            for k in range(size):
                 bag.write(sample(run, k))
-        assert assert_consistent(path, storage) == count
+        assert assert_consistent(path, storage) == size
     with pytest.raises(BagError, match="exists already"):
         twodof.Bag(link)
     assert link.is_symlink() and sorted(file.name for file in tmp_path.iterdir()) == ["far", "link"]
@@ -280,7 +360,7 @@ print(memory.growth)
 @pytest.mark.needs("linux")
 @both_storages
 def test_memory_does_not_grow_with_the_run(native_path, tmp_path, storage):
-    done = python("-c", MEMORY, native_path, tmp_path / "bag", storage, cwd=Path(__file__).parent, check=True)
+    done = python("-c", MEMORY, native_path, tmp_path / "bag", storage, cwd=HERE, check=True)
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000
 

@@ -9,6 +9,7 @@ import importlib.util
 import os
 import platform
 import shutil
+import socket
 import sys
 from collections import Counter
 from pathlib import Path
@@ -35,6 +36,14 @@ class Tool(NamedTuple):
     """Presence on this machine, of what is not a program."""
 
 
+def named() -> bool:
+    """Return whether the machine's own name has an address."""
+    try:
+        return bool(socket.getaddrinfo(socket.gethostname(), None))
+    except OSError:
+        return False
+
+
 TOOLS = {
     "binutils": Tool("the symbols of libraries", "binutils", ("readelf",)),
     "chromium": Tool("pages in a browser", "chromium", ("chromium", "chromium-browser", "google-chrome")),
@@ -48,6 +57,7 @@ TOOLS = {
     "foxglove": Tool("Foxglove's own client", names=(str(NODE / "@foxglove"),), remedy=INSTALL),
     "g++": Tool("ROS 2 networks with Fast DDS", "g++", ("g++", "c++")),
     "gcc": Tool("the engine's inner functions in C", "gcc", ("gcc", "cc", "clang")),
+    "hostname": Tool("a page under the machine's own name", remedy="add it to /etc/hosts", here=named()),
     "ip": Tool("separate networks", "iproute2"),
     "linux": Tool("Linux's own rules", remedy="run on Linux", here=sys.platform == "linux"),
     "linux64": Tool("libraries for Linux x86-64", remedy="run on Linux x86-64", here=X86_64),

@@ -139,15 +139,23 @@ def path_of(value: object, wanted: str) -> Path:
     return Path(value)
 
 
-def no_such(wanted: str, path: Path) -> str:
-    """Return the message for a path of the wrong kind or without a file: its kind, or a similar path."""
+def no_such(wanted: str, path: Path, *others: str) -> str:
+    """Return the message for a path of the wrong kind or without a file: its kind, or a similar path.
+
+    Args:
+        wanted: the kind that is wanted, a key of ``KINDS``.
+        path: the path.
+        others: further kinds that would do.
+    """
+    near = neighbour(path, wanted, *others)
+    if others:
+        wanted = f"{', '.join([wanted, *others[:-1]])} or {others[-1]}"
     words, command = KINDS.get(kind_of(path), ("", ""))
     if words:
         use = f"; '{command} {shlex.quote(str(path))}' takes it" if command else ""
         return f"'{path}' is no {wanted}: it is {words}{use}"
     if not path.parent.is_dir():
         return f"there is no {wanted} '{path}': there is no folder '{path.parent}'"
-    near = neighbour(path, wanted)
     made = f"; make one with '{MAKERS[wanted]}'" if wanted in MAKERS else ""
     return f"there is no {wanted} '{path}'" + (f"; did you mean '{near}'?" if near else made)
 

@@ -14,11 +14,10 @@ from typing import Protocol
 
 from rosbags.rosbag2 import WriterError
 
-from ..bounds import MAX_METADATA
 from ..errors import BagError
-from ..files import lock, read_file, refusing, sync, target_of
+from ..files import lock, refusing, sync, target_of
 from ..ros.messages import Topic, store_of
-from .provenance import read_provenance, robots_of
+from .old_bag import OldBag, check_free
 from .storage import REMOVED, STORAGES, BagWriter, check_path
 
 RESERVE = "reserve"
@@ -70,7 +69,7 @@ class Store:
         self._names: set[str] = set()  # namespaces in the closed bag
         self._ended = True  # a bag that has not begun accepts nothing
         self._failure: Exception | None = None
-        _check_free(path, overwrite)
+        check_free(path, overwrite=overwrite)
 
     def enter(self, part: Part) -> None:
         """Add one robot's part; the first one creates the folder.
@@ -89,7 +88,7 @@ class Store:
             raise BagError(f"the robots of the bag '{self.path}' need namespaces that differ")
         try:
             if not self._entered:
-                _check_free(self.path, self._overwrite, clear=True)
+                self._old = OldBag(self.path, overwrite=self._overwrite)
                 self._create()
             try:
                 part.open()
@@ -151,6 +150,9 @@ class Store:
         sound = self._closed and self._failure is None
         if sound and isinstance(exception, Exception) and not any(part.stored() for part in self._parts):
             shutil.rmtree(self.path, ignore_errors=True)  # the FMU failed before its first sample
+        elif sound:
+            self._old.remove()
+        self._old.restore()
         self._parts.clear()
         if self._failure is not None and not isinstance(exception, BagError):
             raise self._error(self._failure) from self._failure
@@ -171,6 +173,7 @@ class Store:
                 reserve.flush()
                 os.fsync(reserve.fileno())
         except (WriterError, BlockingIOError):  # another process has the folder
+            self._old.restore()
             raise
         except BaseException:
             self._remove()
@@ -180,6 +183,7 @@ class Store:
         with suppress(OSError, sqlite3.Error):
             self.writer.abort()
         shutil.rmtree(self.path, ignore_errors=True)
+        self._old.restore()
         with suppress(OSError):
             os.close(self._lock)
 
@@ -208,6 +212,8 @@ class Store:
                 if closing := self._closing:
                     (self.path / RESERVE).unlink(missing_ok=True)
                 self._store()
+                if any(part.stored() for part in self._parts):
+                    self._old.remove()
                 self._stores += 1
         except Exception as error:  # raised in the main thread
             self._failure = error
@@ -263,35 +269,3 @@ def _reason(error: Exception) -> str:
     if full or "full" in str(error):
         return "the disk is full"
     return (isinstance(error, OSError) and error.strerror) or str(error)
-
-
-def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
-    """Refuse an existing folder, except one that may be overwritten, which ``clear`` removes."""
-    try:
-        if not path.exists():
-            return
-        if not overwrite:
-            reason = "exists already; choose another with `path` or give `overwrite=True`"
-            raise BagError(f"'{path}' {reason}")
-        held = lock(path)
-        try:
-            if not _is_bag(path):
-                raise BagError(f"'{path}' is not a bag and is not overwritten")
-            if clear:
-                shutil.rmtree(path)
-        finally:
-            os.close(held)
-    except BlockingIOError as error:
-        reason = "is being written by another process and is not overwritten"
-        raise BagError(f"'{path}' {reason}") from error
-    except OSError as error:
-        raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
-
-
-def _is_bag(path: Path) -> bool:
-    """Return whether a folder has rosbag2's metadata, or the provenance of a writer that died."""
-    try:
-        metadata = read_file(path / "metadata.yaml", MAX_METADATA, follow=False)
-        return metadata.startswith(b"rosbag2_bagfile_information:")
-    except OSError:
-        return any(read_provenance(path, name) for name in robots_of(path))

@@ -1,0 +1,103 @@
+"""The bag that a new one replaces."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from ..bounds import MAX_METADATA
+from ..errors import BagError
+from ..files import lock, read_file, temporary_folder
+from .provenance import read_provenance, robots_of
+
+REPLACED = ".replaced"
+
+
+class OldBag:
+    """The bag that a new one replaces, if any; it keeps the suffix .replaced until the new one has samples.
+
+    Whenever the process is killed, one of them is whole, or as far as it was written.
+
+    Args:
+        path: folder of both.
+        overwrite: whether there may be an old bag.
+
+    Raises:
+        BagError: the folder is not a bag, is being written, or exists and may not be overwritten.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        self._path, self._kept = path, path.with_name(path.name + REPLACED)
+        self._locks: list[int] = []
+        if (held := _hold(path, overwrite)) is None:
+            return
+        self._locks.append(held)
+        try:
+            left = _hold(self._kept, overwrite)  # by a run that was killed
+            self._locks += [] if left is None else [left]
+            _remove(self._kept)
+            path.rename(self._kept)
+        except OSError as error:
+            self._release()
+            raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
+        except BaseException:
+            self._release()
+            raise
+
+    def restore(self) -> None:
+        """Move the old bag back to its own name, unless there is another bag of this name."""
+        if self._locks and not self._path.exists():
+            self._kept.rename(self._path)
+        self._release()
+
+    def remove(self) -> None:
+        """Remove the old bag; if this fails, the next run that overwrites removes it."""
+        if self._locks:
+            with suppress(OSError):
+                _remove(self._kept)
+            self._release()
+
+    def _release(self) -> None:
+        while self._locks:
+            os.close(self._locks.pop())
+
+
+def check_free(path: Path, *, overwrite: bool) -> None:
+    """Raise BagError if a new bag cannot have this path."""
+    if (held := _hold(path, overwrite)) is not None:
+        os.close(held)
+
+
+def _hold(path: Path, overwrite: bool) -> int | None:
+    """Lock a bag that may be overwritten; return the lock's descriptor, or None if there is nothing."""
+    try:
+        if not path.exists():
+            return None
+        if not overwrite:
+            reason = "exists already; choose another with `path` or give `overwrite=True`"
+            raise BagError(f"'{path}' {reason}")
+        held = lock(path)
+    except BlockingIOError as error:
+        reason = "is being written by another process and is not overwritten"
+        raise BagError(f"'{path}' {reason}") from error
+    except OSError as error:
+        raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
+    if not _is_bag(path):
+        os.close(held)
+        raise BagError(f"'{path}' is not a bag and is not overwritten")
+    return held
+
+
+def _is_bag(path: Path) -> bool:
+    """Return whether a folder has rosbag2's metadata, or the provenance of a writer that died."""
+    try:
+        metadata = read_file(path / "metadata.yaml", MAX_METADATA, follow=False)
+        return metadata.startswith(b"rosbag2_bagfile_information:")
+    except OSError:
+        return any(read_provenance(path, name) for name in robots_of(path))
+
+
+def _remove(bag: Path) -> None:
+    """Remove a bag, if there is one, at once; a process that is killed meanwhile leaves a temporary folder."""
+    if bag.exists():
+        with temporary_folder(bag.parent) as folder:
+            bag.rename(folder / bag.name)
