@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,11 +23,11 @@ from twodof.geometry.kinematics import Kinematics
 from twodof.geometry.reach import nearest
 from twodof.plant.urdf import read_urdf
 from twodof.simulation import master
-from twodof.simulation.causes import Cause
+from twodof.simulation.cause import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
 from twodof.simulation.setup import robot_of
-from twodof.simulation.verdict import _also
+from twodof.simulation.verdict_text import _also
 
 STEP = 0.001
 
@@ -72,6 +73,9 @@ def test_the_page_names_the_same_causes_in_the_same_order(failed: Failed) -> Non
     expected = [c.kind for c in failed.verdict.causes if c.kind != "time" or c.share > 5.0]
     kinds = [[*dict.fromkeys(each)] for each in ([c["kind"] for c in found], expected)]
     assert kinds[0] == kinds[1]
+    assert {c["kind"] for c in found if not c["noted"]} == {c.kind for c in failed.verdict.causes if not c.noted} & {
+        *kinds[0]
+    }
     if joint := failed.verdict.causes[0].joint:
         assert joint in found[0]["text"] or "rad: " in found[0]["text"]
 
@@ -93,6 +97,39 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
     settings = [{**failure.settings, **change} for change in (cured, same)]
     outcomes = [failures.run(failure._replace(settings=each)).verdict.outcome for each in settings]
     assert outcomes == ["reached", "not reached"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({"x_des": (0.5, 0.1)}, "note: the arm is near a singularity"),
+        ({"x_des": (0.5, 0.1), "Kd": 1.0}, "also Kd[1] = 1 s⁻¹ damps Kp[1] = 50 s⁻² too little"),
+        ({"x_des": (0.5, 0.1)}, "with Kp = 50, Kd = 40"),
+        ({"x_des": (0.5, 0.1)}, "not within 2 % of the first error, 0.282 m"),
+        ({"x_des": (0.5, 0.1), "Kp": (900.0, 100.0)}, "with Kp = (900, 100), Kd = 40"),
+        ({"x_des": (200.0, 50.0)}, "times the limit of joint 'joint1'"),
+        ({"Kp": 0.5}, "joint 'joint2' still moving at"),
+        ({"q_max": (0.6, 0.4)}, "at rest with 'joint1', 'joint2' at their limits"),
+        ({"payload": 2.0, "limit_effort": True}, "payload = 2 kg, limit_effort = true"),
+    ],
+)
+def test_a_failed_run_has_a_line(settings: dict[str, Any], line: str) -> None:
+    lines = twodof.simulate(fmu_of("arm", "task"), settings={**settings, **failures.LARGE_STEPS}).verdict.lines
+    assert any(line in each for each in lines), "\n".join(lines)
+
+
+def test_a_reached_target_needs_no_settings_and_no_percentage_is_large() -> None:
+    lines = twodof.simulate(fmu_of("arm", "task"), settings=failures.LARGE_STEPS).verdict.lines
+    assert lines[0].startswith("reached") and lines[1].endswith("steady at the end") and len(lines) == 3
+
+
+def test_an_arm_that_stops_short_of_the_nearest_point_says_so() -> None:
+    settings = {"q_max": (0.6, 0.4), **failures.LARGE_STEPS}
+    verdict = twodof.simulate(fmu_of("arm", "task"), settings=settings).verdict
+    (reach,) = (cause for cause in verdict.causes if cause.kind == "reach")
+    assert verdict.numbers["final_error"] > 1.2 * reach.share
+    assert re.search(r"nearest reachable point is \(.*\) m, [\d.]+ m from the end effector", reach.text)
+    assert not [cause for cause in verdict.causes if cause.noted and cause.kind not in ("effort", "velocity")]
 
 
 def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:

@@ -127,7 +127,7 @@ class App {
     const stopped = robot.stopped(k), stuck = robot.sticking(k).filter((joint) => !stopped.includes(joint));
     const told = !stuck.length || panel.causes.some((line) => line.includes("sticks"));
     const sticks = told ? "" : `${stuck.map(({ name }) => name).join(", ")}: held by friction`;
-    const lines = [blind, session.message, session.notice, ...panel.causes, sticks, picture.handle.hint];
+    const lines = [blind, session.message, session.notice, ...panel.causes, sticks, panel.causes.length ? "" : picture.handle.hint];
     const text = lines.filter(Boolean).join("\n");
     if (byId("message").textContent !== text) byId("message").textContent = text;
   }

@@ -1,14 +1,15 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
+import { spectralRadius } from "./sampled_loop.js";
 import { Search, off, solved, squared } from "./search.js";
 
 /** @typedef {import("./robot.js").Robot} Robot */
 
 /**
- * A cause in words, and its kind, one of those in twodof/simulation/causes.py, with the share of the time or of a limit
- * by which causes of one kind are ranked.
+ * A cause in words, and its kind, one of those in twodof/simulation/cause.py, with the share of the time or of a limit
+ * by which causes of one kind are ranked, and whether it is only a consequence of another one, or of the motion.
  */
-/** @typedef {{kind: string, text: string, share: number, joint: number}} Cause */
+/** @typedef {{kind: string, text: string, share: number, joint: number, noted: boolean}} Cause */
 
 const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
 const HELD = 1e-3; // m or rad: a smaller error of an output that is held, and that only falls, is no failure
@@ -19,6 +20,8 @@ const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singu
 const CREEPING = 1e-5; // rad/s or m/s
 const FEWEST = 0.2; // damping ratio below which the damping is insufficient
 const TAIL = 256, FAST = 0.25; // examined last samples, and reversals in the time of a step that are too many
+const MOTION = ["effort", "velocity"], FOLLOWING = ["limit", "saturation", "singularity"], EXPLAINED = 0.1; // as in causes.py
+const UNSTABLE = 1 + 1e-4; // spectral radius
 const GAINS = [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]]; // of position or joints, and of orientation
 
 export class Verdict {
@@ -36,10 +39,13 @@ export class Verdict {
 
   /** @returns {string[]} Lines of the verdict at the latest sample. */
   lines() {
-    const causes = this.causes().map(({ text }) => text);
-    if (!this.session.follows) return causes;
-    if (!this.missed().includes(true)) return causes.slice(0, 1).map((text) => `reached; but ${text}`);
-    return causes.slice(0, 3).map((text, i) => (i ? `also ${text}` : `not reached: ${text}`));
+    const [root, ...others] = this.causes();
+    if (!root) return [];
+    if (!this.session.follows) return [root, ...others].map(({ text }) => text);
+    if (!this.missed().includes(true)) return [`reached; but ${root.text}`];
+    /** @type {(noted: boolean, word: string) => string[]} */
+    const rest = (noted, word) => others.filter((other) => other.noted === noted).map(({ text }) => `${word} ${text}`);
+    return [`not reached: ${root.text}`, ...rest(false, "also"), ...rest(true, "note:")].slice(0, 3);
   }
 
   /** @returns {Cause[]} Causes at the latest sample, the root first. */
@@ -67,9 +73,16 @@ export class Verdict {
   ranked(found) {
     const order = this.robot.facts.causes, driven = found.some(({ kind }) => kind === "limit") ? this.driven() : [];
     const motors = Math.max(0, ...found.filter(({ kind }) => kind === "saturation").map(({ share }) => share));
+    /** @type {(cause: Cause) => boolean} */
+    const passing = ({ kind, share, joint }) => kind === "limit" && (share < motors || driven[joint]);
     /** @type {(cause: Cause) => number} */
-    const rank = ({ kind, share, joint }) => order.indexOf(kind === "limit" && (share < motors || driven[joint]) ? "drag" : kind);
-    return found.sort((a, b) => rank(a) - rank(b) || b.share - a.share);
+    const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind);
+    const [root, ...others] = found.sort((a, b) => rank(a) - rank(b) || b.share - a.share), [error] = this.errors(this.session.count - 1);
+    const leads = ["degrees", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
+    for (const each of others) each.noted = passing(each) || MOTION.includes(each.kind) || (leads && FOLLOWING.includes(each.kind));
+    const stands = others.some(({ kind, noted }) => kind === "limit" && noted);
+    for (const each of others) each.noted ||= stands && each.kind === "singularity";
+    return found;
   }
 
   /** Whether the controller pulls each joint away from the nearer limit. */
@@ -139,7 +152,7 @@ export class Verdict {
     if (distance <= Math.max(BAND * this.way[0], FLOOR)) return outside;
     const millimetres = Math.max(...wanted.map(Math.abs)) > 10 ? "; is it in millimetres?" : "";
     const text = `target out of reach by ${short(distance)} m${millimetres}; the nearest reachable point is (${point.map(short).join(", ")}) m`;
-    return [cause("reach", text)];
+    return [cause("reach", text, distance)];
   }
 
   /** @type {(missed: boolean[]) => Cause[]} */
@@ -171,7 +184,7 @@ export class Verdict {
     return session.held("friction").flatMap((size, i) => {
       const [still, late] = size > 0 ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
       const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
-      return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} holds it`, still)] : [];
+      return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still)] : [];
     });
   }
 
@@ -189,7 +202,7 @@ export class Verdict {
     return ["effort", "velocity"].flatMap((kind, side) => this.joints.flatMap((joint, i) => {
       const limit = [joint.effort, joint.velocity][side] ?? Infinity, group = ["tau", "v"][side];
       const peak = Math.max(...this.picked().map((k) => Math.abs(this.session.value(group, k, i))));
-      const text = `joint '${joint.name}' needs ${["an effort", "a speed"][side]} beyond the URDF's limit of ${short(limit)}`;
+      const text = `joint '${joint.name}' needs ${["an effort", "a speed"][side]} beyond the URDF's limit of ${short(limit)} ${side ? speedUnit(joint) : forceUnit(joint)}`;
       return peak > limit * (1 + 1e-9) ? [cause(kind, text, peak / limit)] : [];
     }));
   }
@@ -210,7 +223,7 @@ export class Verdict {
     return found;
   }
 
-  /** A joint that reverses as fast as the controller's steps, or else gains with a negative phase margin. */
+  /** A joint that reverses as fast as the controller's steps, or else gains of an unstable loop. */
   sampled() {
     const { session, joints } = this, last = session.count - 1, first = Math.max(0, last + 1 - TAIL);
     const [period, delay] = ["control_period", "control_delay"].map((name) => Number(session.values.get(name) ?? 0));
@@ -231,13 +244,11 @@ export class Verdict {
       const often = `joint '${joints[joint].name}' reverses every ${short(step / most)} s`;
       return [cause("sampling", `${often}: the gains are too high for ${settings(joint + 1)}`)];
     }
+    const differences = session.values.get("v_from_q") === true;
     return GAINS.flatMap(([stiff, damp]) => {
-      const Kd = session.held(damp), margins = session.held(stiff).map((p, i) => {
-        const crossing = Math.sqrt((Kd[i] ** 2 + Math.sqrt(Kd[i] ** 4 + 4 * p * p)) / 2); // rad/s, of (Kd s + Kp) / s²
-        return Math.atan2(Kd[i] * crossing, p) - crossing * (period / 2 + delay);
-      });
-      const i = margins.indexOf(Math.min(...margins));
-      return margins[i] < 0 ? [cause("sampling", `${stiff}[${i + 1}] and ${damp}[${i + 1}] are too high for ${settings()}`)] : [];
+      const Kd = session.held(damp), radii = session.held(stiff).map((p, i) => spectralRadius(p, Kd[i], period, delay, differences));
+      const i = radii.indexOf(Math.max(...radii));
+      return radii[i] > UNSTABLE ? [cause("sampling", `${stiff}[${i + 1}] and ${damp}[${i + 1}] are too high for ${settings()}: the loop is unstable`)] : [];
     });
   }
 
@@ -279,7 +290,7 @@ export class Verdict {
 
 /** @type {(kind: string, text: string, share?: number, joint?: number) => Cause} */
 function cause(kind, text, share = 0, joint = -1) {
-  return { kind, text, share, joint };
+  return { kind, text, share, joint, noted: false };
 }
 
 /** A number with four digits. */
@@ -287,3 +298,6 @@ function cause(kind, text, share = 0, joint = -1) {
 function short(value) {
   return String(Number((Math.abs(value) < 1e-9 ? 0 : value).toPrecision(4))).replace("-", "\u2212");
 }
+
+/** @type {(joint: {prismatic: boolean}) => string} */
+const forceUnit = ({ prismatic }) => (prismatic ? "N" : "N·m"), speedUnit = ({ prismatic }) => (prismatic ? "m/s" : "rad/s");

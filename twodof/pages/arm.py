@@ -30,7 +30,7 @@ from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
 from ..plots.scripts import packed, script
 from ..ros.messages import JOINT_STATE, POINT, POSE, STREAM, definition
-from ..simulation.causes import KINDS
+from ..simulation.cause import KINDS
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 

@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..files import NUMBER
-from .causes import FLOOR, MANY_CHANGES, Cause, causes, point_text
+from .cause import FLOOR, MANY_CHANGES, Cause
+from .causes import causes
 from .expressions import expression
 from .judge import BAND, BLOCK, OUTPUTS, Judge
 from .motion import motion_of
 from .setup import Array, Setup
+from .verdict_text import lines_of
 
 OF_THE_END = 0.1  # last fraction of a run, in which a moving target still changes and an error must stay in its band
 HELD = 1e-3  # m, rad: a smaller error of an output that is held, and that only falls, is no failure
@@ -87,7 +89,17 @@ SHAPE = {
     "samples": int,
     "duration": NUMBER,
     "numbers": {str: NUMBER | None},
-    "causes": [{"kind": str, "text": str, "joint": str, "share": NUMBER, "time": NUMBER | None, "point": [NUMBER]}],
+    "causes": [
+        {
+            "kind": str,
+            "text": str,
+            "joint": str,
+            "share": NUMBER,
+            "time": NUMBER | None,
+            "point": [NUMBER],
+            "noted": bool,
+        }
+    ],
     "lines": [str],
 }
 """Shape of a stored verdict."""
@@ -160,7 +172,7 @@ def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:
     outcome = ("not " if missed else "") + ("followed" if moving else "reached") if judge.aims else "no target"
     motion = "diverging" if known else motion
     why = (*known, *causes(judge, missed, motion))
-    lines = _lines(judge, outcome, motion, numbers, why)
+    lines = lines_of(judge, outcome, motion, numbers, why)
     return Verdict(outcome, motion, judge.count, judge.duration, numbers, why, lines)
 
 
@@ -215,75 +227,3 @@ def _lagging(judge: Judge) -> list[str]:
     """Return the outputs that do not follow their moving targets in the second half of the run."""
     late = {name: judge.error_history(name)[len(judge.history()) // 2 :] for name in judge.aims}
     return [name for name, e in late.items() if np.sqrt(np.mean(e * e)) > max(FOLLOWED * judge.travel, FLOOR)]
-
-
-# --- in words ---
-
-
-def _lines(
-    judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...]
-) -> tuple[str, ...]:
-    off = ", ".join(_distances(judge, numbers))
-    head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
-    if why:
-        but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
-        head += f"{but}{why[0].text}"
-    elif outcome.startswith("not"):
-        head += "; no cause is seen in the samples"
-    lines = [head, _response(outcome, motion, numbers), _peaks(judge), *_also(why)]
-    return tuple(filter(None, lines))
-
-
-def _also(why: tuple[Cause, ...]) -> list[str]:
-    """Return lines for the causes after the first: the worst cause of each kind, and the joints of the others."""
-    kinds = {cause.kind: [other for other in why if other.kind == cause.kind] for cause in why}
-    lines = []
-    for worst, *others in kinds.values():
-        joints = dict.fromkeys(cause.joint for cause in others if cause.joint not in ("", worst.joint))
-        names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
-        parts = [f"also {worst.text}"] * (worst is not why[0]) + [f"likewise {names}"] * bool(names)
-        lines += ["; ".join(parts), *(f"also {cause.text}" for cause in others if not cause.joint)]
-    return lines
-
-
-def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
-    """Return the errors at the end in words."""
-    texts, setup = [], judge.setup
-    if "final_error" in numbers:
-        target = point_text(judge.wanted("x"))
-        texts.append(f"{numbers['final_error']:.3g} m from the target {target} m")
-    if "final_turn_error" in numbers:
-        texts.append(f"{numbers['final_turn_error']:.3g} rad from the target orientation")
-    if "final_joint_error" in numbers:
-        off = np.abs(judge.wanted("q") - judge.end("q"))
-        worst = int(off.argmax())
-        far = f"{off[worst]:.3g} {setup.units[worst]}".strip()
-        texts.append(f"joints at most {far} from their targets, '{setup.joints[worst]}'")
-    return texts
-
-
-def _response(outcome: str, motion: str, numbers: Mapping[str, float]) -> str:
-    """Return settling, overshoot, RMS error and motion in words."""
-    parts, settling = [], numbers.get("settling_time")
-    if outcome in ("reached", "not reached") and settling is not None:
-        parts.append("does not stay within 2 %" if settling == inf else f"within 2 % after {settling:.4g} s")
-        if "overshoot" in numbers:
-            parts.append(f"overshoot {100.0 * numbers['overshoot']:.3g} %")
-    if "rms_error" in numbers:
-        parts.append(f"RMS error {numbers['rms_error']:.3g} m")
-    if not parts and outcome == "no target":
-        return ""
-    rings = (
-        f" at {numbers['frequency']:.4g} Hz, damping ratio {numbers['damping']:.3g}" if "frequency" in numbers else ""
-    )
-    return ", ".join([*parts, (motion + rings if motion in ("oscillating", "diverging") else motion) + " at the end"])
-
-
-def _peaks(judge: Judge) -> str:
-    """Return the peaks in words, as fractions of the URDF's limits."""
-    texts = []
-    for what, use in zip(("effort", "speed"), judge.use()):
-        if use.max(initial=0.0) > 0.0:
-            worst = int(use.argmax())
-            texts.append(f"peak {what} {100.0 * use[worst]:.3g} % of the limit of joint '{judge.setup.joints[worst]}'")
-    return ", ".join(texts)

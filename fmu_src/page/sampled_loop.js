@@ -1,0 +1,31 @@
+/** Stability of a sampled controller: the same closed form as in twodof/simulation/sampled_loop.py. */
+
+const SQUARINGS = 24; // of the loop's matrix A: the norm of A^(2^24), to the power 2^-24, is its spectral radius
+
+/** The spectral radius of q'' = −Kp q − Kd q' between the periods of a sampled controller with a delay. */
+/** @type {(Kp: number, Kd: number, period: number, delay: number, differences: boolean) => number} */
+export function spectralRadius(Kp, Kd, period, delay, differences) {
+  const over = delay - Math.floor(delay / period) * period, whole = Math.floor(delay / period) + Number(period - over < 1e-9);
+  const part = delay - whole * period, rest = period - part, n = 4 + whole;
+  const A = Array.from({ length: n }, () => Array(n).fill(0));
+  const gains = differences ? [-Kp - Kd / period, 0, Kd / period] : [-Kp, -Kd, 0];
+  A[0].splice(0, 2, 1, period);
+  A[1][1] = 1;
+  const ways = [(part * rest + part * part / 2), part], next = [rest * rest / 2, rest];
+  for (const i of [0, 1]) {
+    A[i][3 + whole] += ways[i];
+    for (const k of [0, 1, 2]) A[i][k] += whole ? 0 : next[i] * gains[k];
+    if (whole) A[i][2 + whole] += next[i];
+  }
+  A[2][0] = 1;
+  A[3].splice(0, 3, ...gains);
+  for (let i = 4; i < n; i++) A[i][i - 1] = 1;
+  let power = A, size = 0;
+  for (let k = 0; k < SQUARINGS; k++) {
+    const norm = Math.max(...power.flat().map(Math.abs), 1e-300);
+    size = 2 * (size + Math.log(norm));
+    const scaled = power.map((row) => row.map((value) => value / norm));
+    power = scaled.map((row) => row.map((_, j) => row.reduce((sum, value, m) => sum + value * scaled[m][j], 0)));
+  }
+  return Math.exp((size + Math.log(Math.max(...power.flat().map(Math.abs), 1e-300))) / 2 ** SQUARINGS);
+}

@@ -1,0 +1,54 @@
+"""A cause of a run's failure, and the kinds of causes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .setup import Array
+
+KINDS = {
+    "diverged": "a value that is not finite",
+    "degrees": "a value in degrees where radians are meant",
+    "reach": "the target is out of reach",
+    "gain": "a gain of 0",
+    "feedforward": "a target that rests, with a target velocity or acceleration",
+    "sampling": "an oscillation as fast as the steps of controller or communication",
+    "limit": "a joint at its position limit",
+    "friction": "a joint that sticks",
+    "saturation": "a motor at its effort limit",
+    "load": "a load that the controller does not know",
+    "damping": "too little damping",
+    "singularity": "a singular pose",
+    "time": "gains that are too slow for the duration",
+    "drag": "damping of the joints that the controller does not know",
+    "effort": "an effort beyond the URDF's limit",
+    "velocity": "a speed beyond the URDF's limit",
+}
+"""Kinds of causes in their order; a cause may lead to those after it."""
+FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
+MANY_CHANGES = 12  # changes of a target beyond which it counts as moving
+
+
+class Cause(NamedTuple):
+    """A cause in words, and its kind, a key of KINDS.
+
+    Attributes:
+        share: share of the samples or of a limit, by which causes are ranked; 0 without one.
+        joint: joint concerned, or "".
+        time: time at which it was first seen, s since the first sample; None if it holds for the whole run.
+        point: nearest reachable position in the root frame, m; () for other kinds.
+        noted: whether it is only a consequence: of another cause, or of the motion.
+    """
+
+    kind: str
+    text: str
+    share: float = 0.0
+    joint: str = ""
+    time: float | None = None
+    point: tuple[float, ...] = ()
+    noted: bool = False
+
+
+def point_text(values: Array) -> str:
+    """Return a vector as text, without rounding errors."""
+    return f"({', '.join(f'{value:.4g}' for value in np.round(values, 9) + 0.0)})"

@@ -1,0 +1,130 @@
+"""Causes of a run's failure in the controller: its gains, its sampling, and what it does not know."""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from math import log, sqrt
+
+import numpy as np
+
+from .cause import FLOOR, MANY_CHANGES, Cause, point_text
+from .judge import BAND, Judge
+from .sampled_loop import spectral_radius
+
+UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
+OVERDAMPED = 5.0  # damping ratio from which on less damping is quicker
+FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
+
+
+def gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    """Yield gains of 0 that act on an error."""
+    for group in ("Kp_rot" if name == "quat" else "Kp" for name in missed):
+        zero = [f"{group}[{i + 1}]" for i, gain in enumerate(judge.given(group)) if gain == 0.0]
+        if zero:
+            yield Cause("gain", f"{', '.join(zero)} = 0: the controller does not reduce this error; raise it", 1.0)
+
+
+def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    """Yield target velocities and accelerations that are not 0, while the target rests."""
+    groups = {"x": ("xd_des", "xdd_des"), "quat": ("omega_des", "alpha_des"), "q": ("v_des", "a_des")}
+    for group in (group for name in missed for group in groups[name]):
+        values = judge.given(group)
+        if values.any() and judge.changes <= MANY_CHANGES:
+            yield Cause("feedforward", f"{group} = {point_text(values)} is not 0, while the target rests", 1.0)
+
+
+def load(judge: Judge) -> Iterator[Cause]:
+    """Yield loads, and the damping of joints, that the controller does not know."""
+    if judge.held.get("payload") and not judge.held.get("payload_known"):
+        yield Cause(
+            "load", f"the controller does not know the payload of {judge.held['payload']:g} kg; set payload_known", 1.0
+        )
+    joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
+    usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
+    heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
+    each = heavy or [name for name in usual if usual[name] > 0.0]
+    which = "all joints" if len(each) == len(usual) > 2 else f"joints {', '.join(map(repr, each))}"
+    kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.0)
+    if each:
+        yield Cause(kind, f"the controller does not know the damping of {which}{tail}", share)
+    for group, unit in (("tau_ext", ""), ("f_ext", " N")):
+        values = judge.given(group)
+        if values.any():
+            yield Cause("load", f"{group} = {point_text(values)}{unit} acts, which the controller does not know", 0.5)
+
+
+def sampled(judge: Judge) -> Iterator[Cause]:
+    """Yield a joint that reverses as fast as the steps, or a sampled loop that is unstable."""
+    v, setup = judge.tail("v")[-256:], judge.setup
+    sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
+    continuous = bool(judge.aims) and not any(sampling) and judge.changes <= MANY_CHANGES
+    if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
+        return
+    turns = (np.sign(v[1:]) * np.sign(v[:-1]) < 0.0).mean(axis=0)
+    turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
+    i = int(turns.argmax())
+    if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
+        gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
+        what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
+        text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: the gains{gains} are too high"
+        yield Cause("sampling", f"{text} for {what}", float(turns[i]), setup.joints[i])
+    elif any(sampling):
+        yield from _unstable(judge, *sampling)
+
+
+def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
+    """Yield a cause if the sampled loop is unstable, even while limits hold the joints."""
+    loop = partial(spectral_radius, period=period, delay=delay, differences=bool(judge.setup.starts.get("v_from_q")))
+    for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
+        pairs = enumerate(zip(judge.given(stiff), judge.given(damp)))
+        radius, i, p, d = max(((loop(*pair), i, *pair) for i, pair in pairs), default=(0.0, 0, 0.0, 0.0))
+        if radius > UNSTABLE:
+            gains = f"{stiff}[{i + 1}] = {p:g} s⁻² and {damp}[{i + 1}] = {d:g} s⁻¹ are too high"
+            text = f"{gains} for control_period = {period:g} s and control_delay = {delay:g} s: the loop is unstable"
+            yield Cause("sampling", f"{text}, an error grows {radius:.3g} times in a period", log(radius))
+
+
+def _sampling(judge: Judge, i: int) -> Iterator[str]:
+    """Yield the settings of a sampled controller and of the sensors of joint i."""
+    starts, unit = judge.setup.starts, judge.setup.units[i]
+    period, coarse = starts.get("control_period", 0.0), starts.get(f"q_resolution[{i + 1}]", 0.0)
+    for name, of in (("control_period", "s"), ("control_delay", "s"), (f"q_resolution[{i + 1}]", unit)):
+        if starts.get(name):
+            yield f"{name} = {starts[name]:g} {of}"
+    if coarse and period and starts.get("v_from_q"):
+        yield f"so velocities in steps of {coarse / period:.4g} {unit}/s"
+    for name, of in ((f"q_noise[{i + 1}]", unit), (f"v_noise[{i + 1}]", f"{unit}/s")):
+        if starts.get(name):
+            yield f"{name} = {starts[name]:g} {of}"
+
+
+def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    """Yield gains with a small damping ratio."""
+    for stiff, damp in dict.fromkeys(("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd") for name in missed):
+        Kp, Kd = judge.given(stiff), judge.given(damp)
+        ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
+        if ratios and min(ratios)[0] < 0.2:
+            ratio, i, p, d = min(ratios)
+            text = f"{damp}[{i + 1}] = {d:g} s⁻¹ damps {stiff}[{i + 1}] = {p:g} s⁻² too little"
+            yield Cause("damping", f"{text}: critical damping is {2.0 * sqrt(p):.4g} s⁻¹", 1.0 - ratio)
+
+
+def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    """Yield a cause for each output whose error still shrinks, with the remaining time by its rate."""
+    t = judge.history()
+    for name in missed:
+        aim = judge.aims[name]
+        size = np.array(judge.error_history(name))
+        k = int(np.searchsorted(t, judge.changed + 0.8 * (judge.duration - judge.changed)))
+        if len(size) < 4 or k >= len(size) - 1 or not 0.0 < size[-1] < size[k] * (1.0 - 1e-6):
+            continue
+        rate = log(size[k] / size[-1]) / (t[-1] - t[k])
+        left = log(max(size[-1] / max(BAND * aim.first, FLOOR), 1.0)) / rate
+        what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
+        steady = bool((np.diff(size[k:]) < 0.0).all())
+        if steady and left < 1000.0 * judge.duration:
+            late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
+            text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
+            stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
+            ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
+            remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > OVERDAMPED else "raise the gains"
+            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or {remedy}", left)
