@@ -91,6 +91,7 @@ def test_a_picture_is_the_end_of_the_run(bag, tmp_path):
 def test_what_makes_no_film_is_said(bag, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     for name, more, words in (
+        (".png", [], "the name of an export ends in .html, .mp4, .webp, .gif, .png"),
         ("run.avi", [], "the name of an export ends in .html, .mp4, .webp, .gif, .png"),
         ("run.mp4", ["--fmu", "a.fmu"], "a film shows the arm as lines, without meshes; leave out --fmu"),
         ("run.mp4", [], "cannot write"),

@@ -160,6 +160,8 @@ BAD_TABLES = {
     "column of another control": ("time,tau_cmd\n0,1\n", "it belongs to control 'effort'; this FMU has"),
     "column without a name": ("time,\n0,1\n", "no variable ''"),
     "no number": ("time,Kn\n0,high\n", "row 2: Kn = 'high' is not a number"),
+    "an underscore": ("time,Kn\n0,1_0\n", "row 2: Kn = '1_0' is not a number"),
+    "Arabic digits": ("time,Kn\n0,١\n", "row 2: Kn = '١' is not a number"),
     "empty cell": ("time,Kn\n0,\n", "row 2: Kn = '' is not a number"),
     "two columns of one name": ("time,Kn,Kn\n0,1,1\n", "two columns for 'Kn'"),
     "parameter": ("time,rtol\n0,1\n", "rtol is not an input"),

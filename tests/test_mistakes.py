@@ -111,6 +111,8 @@ MISTAKES: dict[str, str] = {
     "plot bag --frame endeffector -o x.png": "did you mean 'EndEffector'",
     "plot nowhere -o x.jpg": "'x.jpg': the name of a plot ends in .png",
     "build robot.urdf --gravity 0,-9.81,0": "--gravity: expected 3 numbers with spaces between them",
+    "page arm.fmu -o .html": "'.html': the name of a page ends in .html",
+    "info nothing": "there is no FMU, bag or sweep 'nothing'",
     "page arm.fmu -o arm.fmu": "'arm.fmu': the name of a page ends in .html",
     "layouts arm.fmu -o notes.txt": "cannot make the folder 'notes.txt': File exists",
     # sweeps

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,17 @@ def test_names_are_no_commands_to_the_terminal(native_path, tmp_path):
         text = done.stdout + done.stderr
         assert "\\x1b[31mred" in text and "\\u202e" in text
         assert all(c.isprintable() or c == "\n" for c in text)
+
+
+def test_a_line_break_in_a_name_makes_no_line(native_path, tmp_path):
+    """It could look like a fact that the program prints."""
+    path = tmp_path / "forged.fmu"
+    with zipfile.ZipFile(native_path) as source, zipfile.ZipFile(path, "w") as forged:
+        for name in source.namelist():
+            text = source.read(name)
+            if name == "modelDescription.xml":
+                text = text.replace(b'modelName="TwoDof"', b'modelName="TwoDof&#10;verdict  reached"')
+            forged.writestr(name, text)
+    done = run("info", str(path), cwd=tmp_path)
+    assert done.returncode == 0 and "TwoDof\\nverdict  reached" in done.stdout
+    assert not any(line.startswith("verdict") for line in done.stdout.splitlines())

@@ -59,9 +59,10 @@ def say(text: str = "", *, error: bool = False) -> None:
 
 
 def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = "") -> None:
-    """Print rows of texts in aligned columns, each line after a prefix."""
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    for row in rows:
+    """Print rows of texts in aligned columns, each line after a prefix; a line break in a text is an escape."""
+    cells = [[plain(text).replace("\n", "\\n") for text in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    for row in cells:
         say(before + "  ".join(map(align, row, widths)).rstrip())
 
 

@@ -45,6 +45,11 @@ CONTAINER = b'<div class="arm" id="arm"'
 """Mark that identifies a page with an arm."""
 
 
+def names_page(path: Path) -> bool:
+    """Return whether a path may name a page: its suffix is that of a page, and it is more than a suffix."""
+    return path.suffix.lower() in PAGES and (bool(path.suffix) or not path.name.startswith("."))
+
+
 class Arm(NamedTuple):
     """Contents of a robot's page.
 
@@ -89,7 +94,7 @@ def page(
         BuildError: there is no compiler.
     """
     path = Path(output)
-    if path.suffix.lower() not in PAGES:
+    if not names_page(path):
         raise PageError(f"'{path}': the name of a page ends in .html")
     content = page_of(experiment(fmu, stop_time=inf, step=step, settings=settings))
     with refusing(PageError, f"write '{path}'"):

@@ -23,7 +23,7 @@ from ..plant.urdf import RobotError, read_urdf
 from ..plots.scripts import packed
 from ..plots.track import Track, read_tracks
 from ..signatures import ignore, never, with_keywords_of
-from .arm import PAGES, RECORDED, Arm, arm_page
+from .arm import RECORDED, Arm, arm_page, names_page
 from .serving import HOST, PORT, Server
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotO
 
         film(bag, path, urdf=robot.get("urdf"), frame=robot.get("frame"))
         return []
-    if suffix not in PAGES:
+    if not names_page(Path(path)):
         raise PageError(f"'{path}': the name of an export ends in .html, {', '.join(FILMS)}")
     page, remarks = replay(bag, **robot)
     with refusing(PageError, f"write '{path}'"):

@@ -62,6 +62,8 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
         values: dict[str, Value] = {}
         for name, cell in zip(header, row, strict=True):
             try:
+                if "_" in cell or not cell.isascii():  # which Python takes
+                    raise ValueError
                 values[name] = float(cell)
             except ValueError:
                 raise InputError(f"'{path}' row {number}: {name} = '{cell:.50}' is not a number") from None
