@@ -9,7 +9,7 @@ from .cause import FLOOR, Cause, point_text
 from .judge import AT_LIMIT, Judge
 
 STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
-MANY = 10.0  # share from which on a multiple is printed, and no percentage
+MANY = 10.0  # overshoot from which on a multiple is printed, and no percentage
 UNITS = {"x": "m"}  # of errors, rad for the others
 SWITCHES = ("payload_known", "limit_effort")
 CONTROLLER = {
@@ -36,7 +36,7 @@ def lines_of(
     elif outcome.startswith("not"):
         head += "; no cause is seen in the samples"
     settings = _settings(judge) if outcome.startswith("not") else ""
-    lines = [head, *_also(why), _response(judge, outcome, motion, numbers), _peaks(judge), settings]
+    lines = [head, *_also(why), _response(judge, outcome, motion, numbers), _peaks(judge, why), settings]
     return tuple(filter(None, lines))
 
 
@@ -92,7 +92,8 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         late = f"not within 2 % of the first error, {' and '.join(firsts)}"
         parts.append(late if settling == inf else f"within 2 % after {settling:.4g} s")
         if "overshoot" in numbers:
-            parts.append(f"overshoot {_share(numbers['overshoot'])}")
+            past = numbers["overshoot"]
+            parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else f"overshoot {past:,.0f} times the way")
     if "rms_error" in numbers:
         parts.append(f"RMS error {numbers['rms_error']:.3g} m")
     if not parts and outcome == "no target":
@@ -117,17 +118,11 @@ def _rest(judge: Judge, outcome: str) -> str:
     return f"at rest with {names} at {'a limit' if at.sum() == 1 else 'their limits'}" if names else ""
 
 
-def _peaks(judge: Judge) -> str:
-    """Return the peaks in words, as fractions of the URDF's limits."""
-    texts = []
-    for what, use in zip(("effort", "speed"), judge.use()):
-        if use.max(initial=0.0) > 0.0:
+def _peaks(judge: Judge, why: tuple[Cause, ...]) -> str:
+    """Return the peaks in words, as fractions of the URDF's limits; the causes have those beyond."""
+    texts, beyond = [], {cause.kind for cause in why}
+    for kind, what, use in zip(("effort", "velocity"), ("effort", "speed"), judge.use()):
+        if use.max(initial=0.0) > 0.0 and kind not in beyond:
             worst = int(use.argmax())
-            of = "" if use[worst] > MANY else "of "
-            texts.append(f"peak {what} {_share(use[worst])} {of}the limit of joint '{judge.setup.joints[worst]}'")
+            texts.append(f"peak {what} {100.0 * use[worst]:.3g} % of the limit of joint '{judge.setup.joints[worst]}'")
     return ", ".join(texts)
-
-
-def _share(value: float) -> str:
-    """Return a share as a percentage, or a large one as a multiple."""
-    return f"{value:,.0f} times" if value > MANY else f"{100.0 * value:.3g} %"
