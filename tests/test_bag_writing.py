@@ -132,6 +132,14 @@ def test_a_run_that_fails_before_its_first_sample_restores_the_bag_that_it_would
     assert [*tmp_path.iterdir()] == [path] and assert_consistent(path, "mcap") == 5
 
 
+def test_a_run_that_is_interrupted_before_its_first_sample_keeps_the_bag_that_it_would_replace(run, tmp_path):
+    path = tmp_path / "bag"
+    written(run, path, 5)
+    with pytest.raises(KeyboardInterrupt), twodof.Bag(path, overwrite=True).begin(run):
+        raise KeyboardInterrupt
+    assert len(twodof.read_bag(tmp_path / "bag.replaced").t) == 5 and assert_consistent(path, "mcap") == 0
+
+
 def test_a_bag_that_a_killed_run_has_renamed_is_named_and_later_removed(run, tmp_path):
     path = tmp_path / "bag"
     written(run, path, 5)

@@ -150,8 +150,8 @@ class Store:
         sound = self._closed and self._failure is None
         if sound and isinstance(exception, Exception) and not any(part.stored() for part in self._parts):
             shutil.rmtree(self.path, ignore_errors=True)  # the FMU failed before its first sample
-        elif sound:
-            self._old.remove()
+        elif sound and exception is None:
+            self._old.remove()  # by a bag without samples; the thread removes it for others
         self._old.restore()
         self._parts.clear()
         if self._failure is not None and not isinstance(exception, BagError):
