@@ -160,6 +160,8 @@ def test_a_recording_that_cannot_be_fitted_is_refused_in_a_line(change, words, m
 
 
 def test_patterns_and_folders_are_checked(bag, tmp_path):
+    with pytest.raises(InputError, match=r"there are: friction\[1\], friction\[2\], of joints joint1, joint2$"):
+        twodof.fit(ARM, bag, "friction[joint9]")
     with pytest.raises(InputError, match=re.escape("'frictoin[1]' matches no parameter; did you mean 'friction[1]'?")):
         twodof.fit(ARM, bag, "frictoin[1]")
     with pytest.raises(InputError, match="'Kp\\*' matches no parameter"):

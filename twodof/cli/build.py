@@ -28,7 +28,8 @@ def add(build: Parser) -> None:
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu; - is the standard output", output_file)
     option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the shipped planar 2-DoF arm)")
-    option("--robot", dest="stock", type=not_empty, metavar="NAME", help="robot of an installed package, such as panda")
+    text = "robot of an installed package, such as panda; --list-robots prints them"
+    option("--robot", dest="stock", type=not_empty, metavar="NAME", help=text)
     flag("--list-robots", help="print the names of these robots")
     option("--urdf", type=Path, metavar="U", help="another spelling of the URDF argument")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")

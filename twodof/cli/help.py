@@ -130,6 +130,9 @@ class Parser(argparse.ArgumentParser):
         message = re.sub(r"invalid int value: ('.*')$", r"\1 is not a whole number", message)
         message = re.sub(r"invalid float value: ('.*')$", r"\1 is not a number; leave units out", message)
         message = re.sub(r"expected (\d) arguments$", r"expected \1 numbers with spaces between them", message)
+        named = re.match(r"argument ([-\w]+)[^:]*: expected one argument$", message)
+        if named and (action := self._option_string_actions.get(named[1])):
+            message += f": {action.metavar or action.dest.upper()}, {action.help}"
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 
     def _print_message(self, message: str, file: Any = None) -> None:
@@ -149,6 +152,8 @@ class Parser(argparse.ArgumentParser):
 def check_verb(program: Parser, verbs: Iterable[str], arguments: Sequence[str]) -> None:
     """Refuse an unknown verb, or an unknown option before it; name the one that is probably meant."""
     word, named = next(iter(arguments), ""), [*verbs]
+    if not arguments:
+        program.error("there is no verb; begin with 'twodof build', or see 'twodof --help'")
     if word[:1] == "-" and word not in program._option_string_actions:
         check_arguments(program, arguments)
     if word and word[0] != "-" and word not in named:

@@ -130,5 +130,6 @@ def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
     groups = {g: names for causality in causalities for g, names in groups_of(fmu.variables, causality).items()}
     indexed = re.sub(r"_?(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
     known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
-    like = f"; did you mean '{indexed}'?" if indexed in known else choice(name, known, cutoff=0.4)
+    own = [each for each in (indexed, name.rpartition(".")[2]) if each in known]  # Kp of a system, not controller.Kp
+    like = f"; did you mean '{own[0]}'?" if own else choice(name, known, cutoff=0.4)
     return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"

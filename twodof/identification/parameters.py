@@ -147,7 +147,9 @@ class Parameters:
             # brackets are part of names, not of patterns
             matches = fnmatch.filter(names, pattern.replace("[", "[[]"))
             if not matches:
-                raise InputError(f"`free` '{pattern}' matches no parameter{choice(pattern, names)}")
+                group = [name for name in names if "[" in name and name.startswith(pattern.partition("[")[0] + "[")]
+                joints = f"; there are: {', '.join(group)}, of joints {', '.join(robot.joints)}" if group else ""
+                raise InputError(f"`free` '{pattern}' matches no parameter{joints or choice(pattern, names)}")
             chosen.update(matches)
         self.free = [free for name, free in known if name in chosen]
         if not self.free:
