@@ -87,6 +87,7 @@ def test_setting_gives_values_of_variables(fmu, settings, values):
 
 UNRESOLVED = {
     "unknown, a near name": ({"Kpp": 1}, "no variable 'Kpp'; did you mean 'Kp'"),
+    "a gain of a component that there is not": ({"robot.Kp": 1}, "no variable 'robot.Kp'; did you mean 'Kp'"),
     "unknown, other case": ({"KP": 1}, "no variable 'KP'; did you mean 'Kp'"),
     "unknown, a near vector": ({"xdes": 1}, "no variable 'xdes'; did you mean 'x_des'"),
     "unknown, a near parameter": ({"qstart": 1}, "'qstart'; did you mean 'q_start'"),

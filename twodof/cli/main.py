@@ -4,12 +4,14 @@ Imports are inside the verbs, so that ``twodof --help`` is instant.
 """
 
 import argparse
+import errno
 import io
 import logging
 import os
 import re
 import shlex
 import sys
+import tempfile
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
@@ -92,6 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _fail(f"cannot load what it needs: {error}")
         _silence()
         culprit = "" if error.filename is None else f"'{error.filename}': "
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            culprit = culprit or f"the output's folder or '{tempfile.gettempdir()}', which TMPDIR names: "
         return _fail(f"{culprit}{error.strerror or error}")
 
 
