@@ -321,6 +321,20 @@ class Driver:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+def forged(fmu, folder, pattern, text):
+    """Return the path of an FMU with another modelDescription.xml."""
+    path = folder / "forged.fmu"
+    with zipfile.ZipFile(fmu) as archive, zipfile.ZipFile(path, "w") as other:
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name == "modelDescription.xml":
+                changed, count = re.subn(pattern, text, content.decode())
+                assert count
+                content = changed.encode()
+            other.writestr(name, content)
+    return path
+
+
 def changed_step(fmu_path, folder, lines):
     """The default FMU, whose plant does this before each step, or in its place."""
     body = indent(dedent(lines).strip(), "    ")

@@ -7,7 +7,6 @@ import pydoc
 import re
 import subprocess
 import sys
-import zipfile
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -16,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas
 import pytest
-from harness import python
+from harness import forged, python
 
 import twodof
 from twodof.version import versions
@@ -261,14 +260,8 @@ def test_what_needs_an_extra_says_so_when_it_is_used(tmp_path):
 
 
 def test_times_are_those_of_the_fmus_default_experiment(native_path, tmp_path):
-    other = tmp_path / "other.fmu"
-    with zipfile.ZipFile(native_path) as archive, zipfile.ZipFile(other, "w") as changed:
-        for name in archive.namelist():
-            content = archive.read(name)
-            if name == "modelDescription.xml":
-                content = content.replace(b'stopTime="5.0"', b'stopTime="0.3"')
-                content = content.replace(b'stepSize="0.01"', b'stepSize="0.02"')
-            changed.writestr(name, content)
+    default = 'stopTime="5.0"(.*)stepSize="0.01"'
+    other = forged(native_path, tmp_path, default, r'stopTime="0.3"\1stepSize="0.02"')
     run = twodof.experiment(other)
     assert (run.steps, run.step) == (15, 0.02)
     run = twodof.experiment(native_path)

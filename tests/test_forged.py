@@ -1,29 +1,14 @@
 """FMUs whose description was changed by hand: one line that names the culprit, for each command."""
 
 import re
-import zipfile
-from pathlib import Path
 
 import pytest
+from harness import forged
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import PageError, TwoDofError
 from twodof.pages.arm import arm_of
-
-
-def forged(fmu: Path, folder: Path, pattern: str, text: str) -> Path:
-    """An FMU with another modelDescription.xml."""
-    path = folder / "forged.fmu"
-    with zipfile.ZipFile(fmu) as archive, zipfile.ZipFile(path, "w") as other:
-        for name in archive.namelist():
-            content = archive.read(name)
-            if name == "modelDescription.xml":
-                changed, count = re.subn(pattern, text, content.decode())
-                assert count
-                content = changed.encode()
-            other.writestr(name, content)
-    return path
 
 
 @pytest.mark.parametrize(

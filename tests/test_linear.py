@@ -2,13 +2,13 @@
 
 import json
 import re
-import zipfile
 
 import fmpy
 import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
+from harness import forged
 from native_models import model as model_of
 from native_models import robots_folder
 from scipy.linalg import expm
@@ -213,11 +213,7 @@ def test_groups_that_are_chosen(bare):
 
 
 def test_names_of_an_fmu_are_no_commands_to_the_terminal(bare, tmp_path, capsys):
-    other = tmp_path / "Other.fmu"
-    with zipfile.ZipFile(bare) as archive, zipfile.ZipFile(other, "w") as changed:
-        for name in archive.namelist():
-            content = archive.read(name)
-            changed.writestr(name, content.replace(b'"f_ext[1]"', '"\x9b2J[1]"'.encode()))
+    other = forged(bare, tmp_path, r'"f_ext\[1\]"', '"\x9b2J[1]"')
     assert main(["linearise", str(other), "--at", "q=0.1,0.2"]) == 0
     text = capsys.readouterr().out
     assert text.count(r"\x9b2J[1]") == 3  # of the point, of B and of D

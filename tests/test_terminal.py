@@ -3,10 +3,10 @@
 import os
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
+from harness import forged
 
 import twodof
 
@@ -83,13 +83,7 @@ def test_names_are_no_commands_to_the_terminal(native_path, tmp_path):
 
 def test_a_line_break_in_a_name_makes_no_line(native_path, tmp_path):
     """It could look like a fact that the program prints."""
-    path = tmp_path / "forged.fmu"
-    with zipfile.ZipFile(native_path) as source, zipfile.ZipFile(path, "w") as forged:
-        for name in source.namelist():
-            text = source.read(name)
-            if name == "modelDescription.xml":
-                text = text.replace(b'modelName="TwoDof"', b'modelName="TwoDof&#10;verdict  reached"')
-            forged.writestr(name, text)
+    path = forged(native_path, tmp_path, 'modelName="TwoDof"', 'modelName="TwoDof&#10;verdict  reached"')
     done = run("info", str(path), cwd=tmp_path)
     assert done.returncode == 0 and "TwoDof\\nverdict  reached" in done.stdout
     assert not any(line.startswith("verdict") for line in done.stdout.splitlines())
