@@ -228,6 +228,11 @@ def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None
     np.testing.assert_allclose(q_of(ssp, controller__x_des=(0.25, 0.1)), expected, rtol=0, atol=1e-12)
     summary = twodof.simulate(ssp, settings=TARGETS["task"])
     assert summary.verdict.lines == twodof.simulate(whole, settings=TARGETS["task"]).verdict.lines
+    late = {**TARGETS["task"], "Kp": 342.0, "Kd": 30.8}
+    delays = {"control_delay": 0.05}, {"controller.control_delay": 0.05}
+    for fmu, delay in zip((whole, ssp), delays, strict=True):
+        verdict = twodof.simulate(fmu, settings={**late, **delay}).verdict
+        assert verdict.causes[0].kind == "sampling" and "control_delay = 0.05 s" in verdict.causes[0].text
     starts = twodof.load_fmu(ssp).start_values
     assert (starts["controller.control_period"], starts["control_period"]) == (0.01, 0.0)
     assert (starts["controller.payload"], starts["payload"], starts["rigid_stops"]) == (0.1, 0.1, False)

@@ -64,8 +64,11 @@ def _leads(root: Cause, cause: Cause, judge: Judge) -> bool:
     """Return whether the root leads to another cause; a target out of reach does if it explains the whole error."""
     if root.kind == "reach" and not root.point:
         return cause.kind == "limit" and cause.joint == root.joint
-    explains = root.kind == "reach" and judge.aims["x"].last - root.share <= EXPLAINED * root.share
-    return cause.kind in FOLLOWING and (explains or root.kind in ("degrees", "sampling"))
+    if root.kind == "reach":  # by a distance, or by an angle
+        gap = np.linalg.norm(judge.wanted("x") - np.array(root.point)[judge.setup.rows])
+        error = judge.aims["x" if np.isclose(gap, root.share) else "quat"].last
+        return cause.kind in FOLLOWING and error - root.share <= EXPLAINED * root.share
+    return cause.kind in FOLLOWING and root.kind in ("degrees", "sampling")
 
 
 def _degrees(judge: Judge) -> Iterator[Cause]:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from ..geometry.kinematics import Kinematics
 
 Array = NDArray[np.float64]
+OF_THE_CONTROLLER = (
+    "control_period", "control_delay", "q_resolution", "q_noise", "v_noise", "v_from_q", "seed", "payload_known"
+)  # fmt: skip
+"""Parameters that plant and controller of a system both have, and that act in the controller."""
 
 
 class Limits(NamedTuple):
@@ -117,7 +121,16 @@ def setup(
         ends.append(np.array([sign * inf if x is None or abs(x) >= UNBOUNDED else float(x) for x in held]))
     units = tuple("" if joint is None else "m" if joint.prismatic else "rad" for joint in own)
     names = tuple(joints)
-    return Setup(names, units, ends[0], ends[1], limits_of(robot, names), robot, frame, axes, step, starts)
+    return Setup(names, units, ends[0], ends[1], limits_of(robot, names), robot, frame, axes, step, _whole(starts))
+
+
+def _whole(starts: Mapping[str, float]) -> Mapping[str, float]:
+    """Return the start values of a system with those of its controller where the controller decides."""
+    parts = [name.removesuffix("control_period") for name in starts if name.endswith(".control_period")]
+    if len(parts) != 1:
+        return starts
+    own = {name.removeprefix(parts[0]): value for name, value in starts.items() if name.startswith(parts[0])}
+    return {**starts, **{name: value for name, value in own.items() if name.partition("[")[0] in OF_THE_CONTROLLER}}
 
 
 def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, float]) -> Setup:
