@@ -9,7 +9,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from harness import python
 
 import twodof
 from twodof.errors import BagError
@@ -65,13 +64,3 @@ def test_a_foreign_lock_is_not_waited_for_without_end(native_path, tmp_path, mon
         twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     for number in held:
         os.close(number)
-
-
-def test_a_full_folder_of_temporary_files_is_named(native_path, disk, tmp_path):
-    bag, full = tmp_path / "bag", disk(256)
-    twodof.simulate(native_path, twodof.Bag(bag), stop_time=0.1)
-    (full / "fill").write_bytes(b"\0" * 250 * 1024)
-    command = ["view", str(bag), "--export", str(tmp_path / "view.html")]
-    done = python("-m", "twodof", *command, env={**os.environ, "TMPDIR": str(full)}, cwd=native_path.parent)
-    assert done.returncode == 1 and f"'{full}', which TMPDIR names: No space left" in done.stderr
-    assert not (tmp_path / "view.html").exists()

@@ -4,14 +4,12 @@ Imports are inside the verbs, so that ``twodof --help`` is instant.
 """
 
 import argparse
-import errno
 import io
 import logging
 import os
 import re
 import shlex
 import sys
-import tempfile
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
@@ -94,8 +92,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _fail(f"cannot load what it needs: {error}")
         _silence()
         culprit = "" if error.filename is None else f"'{error.filename}': "
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            culprit = culprit or f"the output's folder or '{tempfile.gettempdir()}', which TMPDIR names: "
         return _fail(f"{culprit}{error.strerror or error}")
 
 
@@ -108,7 +104,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
         argcomplete.autocomplete(program)
     for argument in takewhile("--".__ne__, arguments):  # argparse would read it as an empty list
         if re.fullmatch(r"(-\w|--[\w-]+=)--", argument):
-            program.error(f"argument {argument[:-2].rstrip('=')}: '--' is no value")
+            program.error(f"argument {argument[:-2].rstrip('=')}: '--' is not a value")
     check_verb(program, verbs, arguments)
     options, unknown = program.parse_known_args(arguments)
     check_arguments(verbs[options.verb], unknown)
