@@ -375,7 +375,7 @@ def test_what_is_no_bag_is_refused(tmp_path, content):
         path.mkdir()
     if content == "nonsense":
         (path / "metadata.yaml").write_text("hello: [")
-    with pytest.raises(BagError, match=r"cannot read the bag '.*bag'|there is no bag '.*bag'|bag' is no bag: it is"):
+    with pytest.raises(BagError, match=r"cannot read the bag '.*bag'|there is no bag '.*bag'|bag' is not a bag: it is"):
         twodof.read_bag(path)
 
 

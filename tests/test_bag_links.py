@@ -83,7 +83,7 @@ def test_a_pipe_in_the_place_of_messages_is_refused(linked, capsys):
     for command in ("info", "recover"):
         assert main([command, str(linked)]) == 1
         (line,) = capsys.readouterr().err.splitlines()
-        assert line == f"twodof: error: '{file}' is no regular file; remove it from the bag"
+        assert line == f"twodof: error: '{file}' is not a regular file; remove it from the bag"
 
 
 def test_a_bag_that_the_user_names_by_a_link_is_read(linked):

@@ -203,7 +203,7 @@ def test_an_fmu_of_other_settings_is_replaced_on_request_alone(fmu_path, tmp_pat
     assert path.read_bytes() == other
     assert build_fmu(path, overwrite=True).read_bytes() == fmu_path.read_bytes()
     (tmp_path / "B.fmu").write_text("notes")
-    with pytest.raises(TwoDofError, match=r"B\.fmu' is no FMU, and is not replaced"):
+    with pytest.raises(TwoDofError, match=r"B\.fmu' is not an FMU, and is not replaced"):
         build_fmu(tmp_path / "B.fmu")
     assert build_fmu(tmp_path / "B.fmu", overwrite=True).read_bytes() == fmu_path.read_bytes()
 
@@ -258,7 +258,7 @@ def _panda_hand(elbow):
         ({"gravity": (0.0, float("nan"), 0.0)}, r"gravity\[2\] = nan is not finite"),
         ({"gravity": (0.0, -9.81)}, "gravity has 3 elements, 2 were given"),
         ({"mesh_dir": "nowhere"}, "the mesh folder 'nowhere' does not exist"),
-        ({"urdf": ""}, "is no URDF: it is a folder"),
+        ({"urdf": ""}, "is not a URDF: it is a folder"),
         ({"urdf": Path("nowhere.urdf")}, "there is no URDF 'nowhere.urdf'"),
     ],
 )

@@ -140,7 +140,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("another robot", "has no joint 'joint1'"),
         ("short", "is too short"),
         ("still", "joint 'joint2' never moves"),
-        ("nan", "the position of joint 'joint2' at 7 s is no number"),
+        ("nan", "the position of joint 'joint2' at 7 s is not a number"),
         ("millinewton", "a factor of 1000"),
         ("repeated", "several joint states at one time"),
         ("set back", "was the clock set back"),

@@ -58,7 +58,7 @@ def of_fmi3(tmp_path_factory):
     [
         ('start="0.2 0.05"', 'start="0.2 0.05 0.1"', "x_des has 3 start values; expected one, or one"),
         ('start="0.2 0.05"', 'start=""', "x_des has no start values"),
-        ('(name="Kn"[^>]*start=")[^"]*', r"\g<1>1 2", "start value of Kn, '1 2', is no number"),
+        ('(name="Kn"[^>]*start=")[^"]*', r"\g<1>1 2", "start value of Kn, '1 2', is not a number"),
     ],
 )
 def test_a_list_of_start_values_that_is_none_is_refused(of_fmi3, tmp_path, pattern, text, culprit):

@@ -86,7 +86,7 @@ def test_the_command_line_tells_where_it_listens(native_path, number):
         ("Kp", [1.0, 2.0, 3.0], "Kp has 2 elements, 3 were given"),
         ("Kp", "many", "expected a number"),
         ("Kp", None, "expected a number"),
-        ("x_des", 1.0, "'x_des' is no gain of this FMU"),
+        ("x_des", 1.0, "'x_des' is not a gain of this FMU"),
     ],
 )
 def test_what_is_no_gain_is_ignored(native_path, caplog, name, value, reason):

@@ -397,7 +397,7 @@ def test_pause_and_step(native_path, number, listen):
         (["--rate", "nan"], "--rate nan"),
         (["--rate", "inf"], "--rate inf"),
         (["--overwrite"], "--overwrite has no effect without -o"),
-        (["--stop-time", "0.005"], "the run of 0.005 s is no whole number of steps of 0.01 s"),
+        (["--stop-time", "0.005"], "the run of 0.005 s is not a whole number of steps of 0.01 s"),
         (["--on-timeout", "hold", "--lockstep"], "--on-timeout applies to joint commands without --lockstep"),
     ],
 )

@@ -333,7 +333,7 @@ def test_more_joints_than_a_figure_can_show_are_refused(tmp_path):
 
 UNSOUND: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no step": lambda run: run.update(step=0.0),
-    "a step that is no number": lambda run: run.update(step=math.nan),
+    "a step that is not a number": lambda run: run.update(step=math.nan),
     "a step back": lambda run: run.update(step=-0.01),
     "a step without end": lambda run: run.update(step=math.inf),
     "a step that would take all memory": lambda run: run.update(step=1e-9),
@@ -342,7 +342,7 @@ UNSOUND: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a target nowhere": lambda run: run["start_values"].update({"x_des[1]": math.nan}),
     "a target too far": lambda run: run["start_values"].update({"x_des[1]": 1e308}),
     "a target beyond": lambda run: run["start_values"].update({"x_des[1]": 10**400}),
-    "a limit that is no number": lambda run: run["start_values"].update({"q_min[1]": math.nan}),
+    "a limit that is not a number": lambda run: run["start_values"].update({"q_min[1]": math.nan}),
     "a change at the end of time": lambda run: run["input_changes"].append([math.inf, {}]),
     "a change nowhere": lambda run: run["input_changes"].append([0.1, {"x_des[1]": math.inf}]),
     "a change at no time": lambda run: run["input_changes"].append([math.nan, {}]),

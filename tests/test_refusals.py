@@ -183,7 +183,7 @@ BAD: dict[str, Case] = {
     "output below a file": (text("file", "x"), ["build", "-o", "file/x.fmu"], "cannot write 'file/x.fmu': Not a direc"),
     "output a folder": (nothing, ["build", "-o", "."], "cannot write '.'"),
     # an FMU
-    "FMU no zip": (text("bad.fmu", "FMU"), RUN_BAD, "'bad.fmu' is no FMU: .*not a zip"),
+    "FMU no zip": (text("bad.fmu", "FMU"), RUN_BAD, "'bad.fmu' is not an FMU: .*not a zip"),
     "FMU empty zip": (text("bad.fmu", EMPTY_ZIP), RUN_BAD, "'bad.fmu' .*no modelDescription.xml"),
     "FMU damaged": (fmu(description(), change=damaged), RUN_BAD, "'bad.fmu'"),
     "FMI 1.0": (fmu(FMI1), RUN_BAD, "'bad.fmu' is FMI 1.0 .*FMI 2.0"),
@@ -233,7 +233,7 @@ BAD: dict[str, Case] = {
     # the bag
     "bag exists": (a_bag, [*RUN, "-o", "bag"], "'bag' exists already.*--overwrite"),
     "bag is a file": (text("bag", "x"), [*RUN, "-o", "bag"], "'bag' exists already"),
-    "folder that is no bag, --overwrite": (
+    "folder that is not a bag, --overwrite": (
         lambda folder: (folder / "bag").mkdir(),
         [*RUN, "-o", "bag", "--overwrite"],
         "'bag' is not a bag",
@@ -241,9 +241,9 @@ BAD: dict[str, Case] = {
     "file, --overwrite": (text("bag", "x"), [*RUN, "-o", "bag", "--overwrite"], "'bag' is not a bag"),
     "symbolic link to itself, --overwrite": (a_link_to_itself, [*RUN, "-o", "link", "--overwrite"], "link'"),
     "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "stamp_start = -1 s"),
-    "info of a folder": (nothing, ["info", "."], r"'\.' is no bag: it is a folder"),
+    "info of a folder": (nothing, ["info", "."], r"'\.' is not a bag: it is a folder"),
     "info of a bag's file": (text("a.db3", "x"), ["info", "a.db3"], "give the bag's folder"),
-    "info of a file that is no bag": (text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"),
+    "info of a file that is not a bag": (text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"),
     "info of too long a name": (nothing, ["info", LONG], f"'{LONG}'.*too long"),
 }
 
@@ -266,7 +266,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(make, arguments, culprit, fo
 @pytest.mark.parametrize(
     ("arguments", "culprit"),
     [
-        ([], "VERB"),
+        ([], "there is no verb; begin with"),
         (["help", "nothing"], "nothing"),
         (["info"], "FMU|BAG"),
         (["run", "--stop-time", "inf"], "stop time inf s"),
@@ -376,7 +376,7 @@ def test_a_run_replaces_no_file_that_is_not_its_own(folder, capfd):
     (folder / "robot.fmu").write_text("notes")
     run = ["run", "robot.urdf", "--stop-time", "0.1"]
     assert main([*run, "-o", "bag"]) == 1
-    assert "'robot.fmu' is no FMU, and is not replaced" in capfd.readouterr().err
+    assert "'robot.fmu' is not an FMU, and is not replaced" in capfd.readouterr().err
     assert (folder / "robot.fmu").read_text() == "notes"
     (folder / "robot.fmu").unlink()
     assert main([*run, "-o", "first"]) == main([*run, "-o", "second"]) == 0

@@ -118,7 +118,7 @@ REFUSED = {
     ),
     "mimic by a word": (
         arm(elbow=elbow(LIMIT + '<mimic joint="shoulder" multiplier="two"/>')),
-        "'elbow': its <mimic> has a factor or offset that is no number",
+        "'elbow': its <mimic> has a factor or offset that is not a number",
     ),
     "mimics that multiply": (
         arm(

@@ -192,7 +192,7 @@ def test_a_name_without_an_index_sets_all_elements(native_path):
         (["--grid", "limit_effort=0:1:2"], "limit_effort = 0.0: expected true or false"),
         (["--grid", "Kp=1:2:3", "--resume"], "--resume has no effect without -o"),
         (["--grid", "Kp=1:2:3", "--resume", "-o", "none"], "there is no sweep 'none' to resume"),
-        (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists and is no sweep; choose another"),
+        (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists and is not a sweep; choose another"),
         (["--grid", "Kp=1:2:3", "--workers", "0"], "0 workers; at least 1 is needed"),
         (
             ["--grid", "Kp=1:2:3", "--scheduler", "tcp://127.0.0.1:9"],

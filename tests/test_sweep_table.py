@@ -152,7 +152,7 @@ def test_damaged_and_foreign_tables_get_one_line(native_path, tmp_path):
     pandas.DataFrame({"run": [1]}).to_parquet(tmp_path / "cut/runs.parquet")
     with pytest.raises(TwoDofError, match="was not written by twodof"):
         read_sweep(tmp_path / "cut")
-    with pytest.raises(TwoDofError, match="is no sweep"):
+    with pytest.raises(TwoDofError, match="is not a sweep"):
         read_sweep(tmp_path)
     with pytest.raises(TwoDofError, match=r"no sweep '.*none'; make one with 'twodof sweep'"):
         read_sweep(tmp_path / "none")

@@ -430,8 +430,8 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     )
     yield "mapping", ssd(more.format(connection("pd.steps", "plant.seed", own))), {}, "BooleanMappingTransformation"
     far = 'source="file:///etc/passwd"'
-    yield "far", ssd(wired.replace('source="resources/pd.fmu"', far)), {}, "is no file in it"
-    yield "up", ssd(wired.replace("resources/pd.fmu", "../pd.fmu")), {}, "is no file in it"
+    yield "far", ssd(wired.replace('source="resources/pd.fmu"', far)), {}, "is not a file in it"
+    yield "up", ssd(wired.replace("resources/pd.fmu", "../pd.fmu")), {}, "is not a file in it"
     package = 'type="application/x-ssp-package" source='
     yield "package", ssd(wired.replace("source=", package, 1)), {}, "of type application/x-ssp-package"
     dotted, inner = (component("pd").replace('name="pd"', f'name="{name}"') for name in ("a.b", "b"))
@@ -460,7 +460,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     ):
         parts = wired.replace(component("pd"), component("pd", inner))
         yield f"{name} twice", ssd(parts), {}, r"of 'pd' sets 'Kp' twice"
-    yield "no FMU", None, {"resources/pd.fmu": b"PK no zip"}, "resources/pd.fmu' is no FMU"
+    yield "no FMU", None, {"resources/pd.fmu": b"PK no zip"}, "resources/pd.fmu' is not an FMU"
     slip = zipped({"modelDescription.xml": b"<a/>", "../out": b""})
     yield "FMU slips", None, {"resources/pd.fmu": slip}, "is outside of its folder"
     circle = "".join(

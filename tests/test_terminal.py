@@ -33,7 +33,7 @@ def test_a_value_that_argparse_loses_is_refused(arguments, tmp_path):
     (line,) = done.stderr.splitlines()
     option = arguments[-1][:-2].rstrip("=")
     assert done.returncode == 2
-    assert line == f"twodof: error: argument {option}: '--' is no value"
+    assert line == f"twodof: error: argument {option}: '--' is not a value"
 
 
 @pytest.mark.parametrize("verb", ["sweep", "info", "plot"])

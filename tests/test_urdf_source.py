@@ -75,7 +75,7 @@ def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
 @pytest.mark.parametrize(
     ("factor", "lock", "message"),
     [
-        ("abc", "j", "'k': its <mimic> has a factor or offset that is no number"),
+        ("abc", "j", "'k': its <mimic> has a factor or offset that is not a number"),
         ("nan", "j", "'k': its <mimic> has"),
         ("1_0", "j", "'k': its <mimic> has"),
         ("2", "k", "'k' mimics 'j', which moves: lock 'j'"),

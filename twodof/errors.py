@@ -132,10 +132,10 @@ def path_of(value: object, wanted: str) -> Path:
     """Return the path of a file or folder.
 
     Raises:
-        TypeError: the value is no path; the message names what it is the path of.
+        TypeError: the value is not a path; the message names what it is the path of.
     """
     if not isinstance(value, str | PathLike):
-        raise TypeError(f"{value!r:.50} is no path; give the path of the {wanted}")
+        raise TypeError(f"{value!r:.50} is not a path; give the path of the {wanted}")
     return Path(value)
 
 
@@ -153,7 +153,8 @@ def no_such(wanted: str, path: Path, *others: str) -> str:
     words, command = KINDS.get(kind_of(path), ("", ""))
     if words:
         use = f"; '{command} {shlex.quote(str(path))}' takes it" if command else ""
-        return f"'{path}' is no {wanted}: it is {words}{use}"
+        article = "an" if wanted.startswith("FMU") else "a"
+        return f"'{path}' is not {article} {wanted}: it is {words}{use}"
     if not path.parent.is_dir():
         return f"there is no {wanted} '{path}': there is no folder '{path.parent}'"
     made = f"; make one with '{MAKERS[wanted]}'" if wanted in MAKERS else ""

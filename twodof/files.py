@@ -325,7 +325,7 @@ def parsed(text: bytes) -> Any:
     """Parse untrusted JSON.
 
     Raises:
-        ValueError, RecursionError: the text is no JSON, or would take much more memory than its length.
+        ValueError, RecursionError: the text is not JSON, or would take much more memory than its length.
     """
     if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
         raise ValueError("it is damaged")  # empty lists and objects take 24 times the memory of their text

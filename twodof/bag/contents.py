@@ -26,7 +26,7 @@ def storage_files(folder: Path) -> list[Path]:
     if link := next((p for p in named if p.is_symlink()), None):
         raise BagError(f"'{link}' is a link, and links in a bag are not followed; copy the file")
     if odd := next((p for p in named if not (p.is_file() or p.is_dir())), None):
-        raise BagError(f"'{odd}' is no regular file; remove it from the bag")
+        raise BagError(f"'{odd}' is not a regular file; remove it from the bag")
     return sorted(filter(Path.is_file, named), key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
 

@@ -29,7 +29,7 @@ def write_dataset(runs: Sequence[Recording], path: Path) -> None:
 
     Raises:
         BagError: the folder exists or cannot be written, pandas or pyarrow is missing, the bags differ in joints,
-            target or rate, their rate is no whole number of Hz, or they have neither targets nor efforts.
+            target or rate, their rate is not a whole number of Hz, or they have neither targets nor efforts.
     """
     if path.exists():
         raise BagError(f"'{path}' exists, and is not replaced: remove it, or choose another name")

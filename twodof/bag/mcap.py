@@ -169,7 +169,7 @@ def _records(path: Path, budget: ReadBudget, wanted: Sequence[int] = READ) -> It
     """Yield opcode and bytes of each record up to the footer; for a chunk, only its content."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise DamageError(f"'{path.name}' is no MCAP file")
+            raise DamageError(f"'{path.name}' is not an MCAP file")
         size, position = path.stat().st_size, len(MAGIC)
         while True:
             start = position

@@ -37,7 +37,7 @@ def read_bag(path: str | Path) -> Recording:
         path: the bag's folder; for one of several robots, followed by a colon and its namespace.
 
     Raises:
-        BagError: the path is no bag, or the bag is unfinished, damaged or without joint states.
+        BagError: the path is not a bag, or the bag is unfinished, damaged or without joint states.
     """
     return _read(path_of(path, "bag"), _JointStates, _Targets())
 
@@ -186,7 +186,7 @@ def _recording(
 
 
 def whole_bag(path: Path) -> list[Path]:
-    """Return the files of a closed bag; raise BagError for an unfinished bag, or for a path that is no bag."""
+    """Return the files of a closed bag; raise BagError for an unfinished bag, or for a path that is not a bag."""
     files = storage_files(path)
     if not files:
         packed = f"cannot read the bag '{path}': it is compressed as a whole"
@@ -249,7 +249,7 @@ class _JointStates:
             return numbers
         except MixtureError as error:
             raise BagError(f"'{self._path}' has joint states of different {error}") from error
-        except Exception as error:  # rosbags raises any exception for bytes that are no JointState
+        except Exception as error:  # rosbags raises any exception for bytes that are not a JointState
             packed = message.startswith(ZSTD_MAGIC)
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error

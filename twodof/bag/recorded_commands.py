@@ -45,7 +45,7 @@ def read_commands(
     """Return the commands in a bag: times, s, and the inputs that change at these times.
 
     Commands are JointStates, points or poses, as the FMU's control law requires (``ros.commands``). Their times are the
-    recording times relative to the bag's first joint state that is no command. For control 'joint' they may also be
+    recording times relative to the bag's first joint state that is not a command. For control 'joint' they may also be
     JointTrajectories, which are converted to inputs at whole steps (``ros.trajectories``).
 
     Args:
@@ -57,7 +57,7 @@ def read_commands(
         settings: settings of the run: trajectories begin at rest at its q_des, or else at its q_start.
 
     Raises:
-        BagError: the path is no bag, or the bag is unfinished or damaged.
+        BagError: the path is not a bag, or the bag is unfinished or damaged.
         InputError: the bag has no such commands, or an invalid one.
     """
     fmu, path = fmu if isinstance(fmu, Fmu) else load_fmu(fmu), Path(path)

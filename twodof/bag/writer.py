@@ -78,7 +78,7 @@ class Bag(Sink):
         """Return a sink for one of several robots, whose topics have a namespace in the same bag.
 
         Raises:
-            InputError: the namespace is no name of ROS 2.
+            InputError: the namespace is not a name of ROS 2.
         """
         check_name("namespace", namespace)
         robot = copy(self)

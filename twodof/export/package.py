@@ -65,7 +65,7 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
         there = path.is_file() and descriptor_of(path) is None  # /dev/stdout is written into
         if there and not (same or overwrite or is_default_arm(path)):
             raise BuildError(
-                f"'{path}' is {'another' if is_fmu(path) else 'no'} FMU, and is not replaced: move"
+                f"'{path}' is {'another' if is_fmu(path) else 'not an'} FMU, and is not replaced: move"
                 " it away, or build with another `output` or with `overwrite=True`"
             )
         if made_of or not same:

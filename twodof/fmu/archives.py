@@ -43,12 +43,12 @@ def read_archive(path: Path, inside: str) -> tuple[bytes, dict[str, int]]:
     except OSError as error:
         raise FmuError(f"cannot read '{where}': {error.strerror}") from error
     except KeyError as error:
-        raise FmuError(f"'{where}' is no FMU: it has no modelDescription.xml") from error
+        raise FmuError(f"'{where}' is not an FMU: it has no modelDescription.xml") from error
     except UnsafeArchiveError as error:
         raise FmuError(f"'{where}': {error}") from error
     except ZIP_ERRORS as error:
         other = kind_of(path) not in ("", "FMU", "system")
-        why = f"'{where}' is no FMU: it is not a valid zip archive ({error})"
+        why = f"'{where}' is not an FMU: it is not a valid zip archive ({error})"
         raise FmuError(no_such("FMU", path) if other else why) from error
     if not is_plain_xml(xml):
         raise FmuError(f"'{where}': modelDescription.xml declares entities or is not UTF-8")

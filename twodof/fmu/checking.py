@@ -83,7 +83,7 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
         tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos" or "fmuloader".
 
     Raises:
-        FmuError: the file is missing, is no FMU, is unsafe to unzip, or has no co-simulation.
+        FmuError: the file is missing, is not an FMU, is unsafe to unzip, or has no co-simulation.
         InputError: a tool is not installed, or the FMU contains no references for it.
     """
     path = Path(fmu)

@@ -179,8 +179,8 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
         inside: member of the system that is the FMU.
 
     Raises:
-        FmuError: the file is missing, is no zip archive, is unsafe to unzip, or is no co-simulation FMU of FMI 2.0 or
-            3.0.
+        FmuError: the file is missing, is not a zip archive, is unsafe to unzip, or is not a co-simulation FMU of FMI
+            2.0 or 3.0.
     """
     path = path_of(path, "FMU")
     where = path / inside
@@ -211,7 +211,7 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
         try:
             _ = variable.start_value
         except ValueError:
-            raise FmuError(f"'{where}': start value of {name}, '{variable.start:.50}', is no number") from None
+            raise FmuError(f"'{where}': start value of {name}, '{variable.start:.50}', is not a number") from None
     return fmu
 
 

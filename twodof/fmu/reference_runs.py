@@ -144,7 +144,7 @@ class _Files:
         return ET.fromstring(content)
 
     def reference(self, experiment: ET.Element) -> Reference | None:
-        """Return an experiment; None if it has no results as CSV, or is no simulation over time."""
+        """Return an experiment; None if it has no results as CSV, or is not a simulation over time."""
         times = {**experiment.attrib, **getattr(experiment.find("TransientSimulation"), "attrib", {})}
         results, stimuli, parameters = (experiment.find(tag) for tag in ("References", "Stimuli", "Parameters"))
         if results is None or results.get("type", "text/csv") != "text/csv" or "stepSize" not in times:
@@ -175,5 +175,5 @@ class _Files:
         head, *rows = csv.reader(self.read(source).decode("utf-8").splitlines())
         numbers = np.array([[float(cell) for cell in row] for row in rows])
         if numbers.ndim != 2 or numbers.shape[1] != len(head) or not np.isfinite(numbers).all():
-            raise ValueError(f"{source} is no table of finite numbers")
+            raise ValueError(f"{source} is not a table of finite numbers")
         return head[1:], numbers

@@ -203,7 +203,7 @@ class _File:
         parts = urlsplit(source)
         member = posixpath.normpath(unquote(parts.path))
         if parts.scheme or parts.netloc or member not in self._names:
-            raise FmuError(f"'{self._path}': '{source:.80}' of '{name}' is no file in it")
+            raise FmuError(f"'{self._path}': '{source:.80}' of '{name}' is not a file in it")
         return member
 
     def _bound(self, binding: ET.Element, name: str) -> Iterator[Parameter]:

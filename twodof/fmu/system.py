@@ -100,8 +100,8 @@ def load_fmu(path: str | Path, robot: str = "") -> Fmu:
         robot: component of a system with the robot's outputs q and v; "": the only component with such outputs.
 
     Raises:
-        FmuError: the file is missing, is no zip archive, is unsafe to unzip, is no co-simulation FMU of FMI 2.0 or
-            3.0 and no SSP 1.0 file, or has no outputs q[i] and v[i].
+        FmuError: the file is missing, is not a zip archive, is unsafe to unzip, is neither a co-simulation FMU of FMI
+            2.0 or 3.0 nor an SSP 1.0 file, or has no outputs q[i] and v[i].
     """
     path = Path(path)
     if has_member(path, STRUCTURE):

@@ -119,7 +119,7 @@ class Wiring:
             inner = connection.get(f"{end}Element", "")
             name = system.name if not inner else f"{system.name}.{inner}" if system.name else inner
             if name not in self.elements:
-                raise FmuError(f"'{self._path}': a connection names '{inner:.80}', which is no element")
+                raise FmuError(f"'{self._path}': a connection names '{inner:.80}', which is not an element")
             node = Node(name, connection.get(f"{end}Connector", ""))
             gives = (self._kind(node) in SOURCES) == bool(inner)
             ends.append((node, gives))

@@ -159,7 +159,7 @@ class Kinematics:
 
 
 def chains_at(text: str, joints: Sequence[str], q: Sequence[float]) -> list[list[Array]]:
-    """Return the points, m, of each chain of a URDF's links at positions q, rad or m; none if it is no URDF."""
+    """Return the points, m, of each chain of a URDF's links at positions q, rad or m; none if it is not a URDF."""
     try:
         urdf = read_urdf(text)
     except RobotError:

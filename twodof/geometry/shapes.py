@@ -41,7 +41,7 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
         read: function that returns the content of a mesh.
 
     Raises:
-        RobotError: an attribute of a shape is no number.
+        RobotError: an attribute of a shape is not a number.
     """
     shapes, missing = [], []
     named = {material.get("name"): material for material in reversed(robot.tree.findall("material"))}
@@ -149,7 +149,7 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
     """Return the numbers of an attribute.
 
     Raises:
-        ValueError: it has another number of values, or a value that is no number.
+        ValueError: it has another number of values, or a value that is not a number.
     """
     text = default if element is None else element.get(key, default)
     numbers = np.array([float(word) for word in text.split()])

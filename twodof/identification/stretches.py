@@ -169,7 +169,8 @@ def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
     for values, what in ((q, "position"), (tau, "effort")):
         if bad := np.argwhere(~np.isfinite(values)).tolist():
             k, i = bad[0]
-            raise InputError(f"'{name}': the {what} of joint '{robot.joints[i]}' at {recording.t[k]:g} s is no number")
+            where = f"joint '{robot.joints[i]}' at {recording.t[k]:g} s"
+            raise InputError(f"'{name}': the {what} of {where} is not a number")
     return q, tau
 
 

@@ -89,7 +89,7 @@ def page(
         settings: start values of inputs and parameters, as for ``experiment``.
 
     Raises:
-        FmuError, InputError: the file is no FMU, or a setting is invalid.
+        FmuError, InputError: the file is not an FMU, or a setting is invalid.
         PageError: the FMU is not a native one of this package, or the page has another suffix or cannot be written.
         BuildError: there is no compiler.
     """

@@ -182,7 +182,7 @@ class _Gains(ServerListener):
                 if not self._control:
                     raise InputError("Foxglove may not set gains; `set_gains=True` allows it")
                 if parameter.name not in self._groups:
-                    raise InputError(f"'{parameter.name:.80}' is no gain of this FMU")
+                    raise InputError(f"'{parameter.name:.80}' is not a gain of this FMU")
                 asked = resolve(self._fmu, {parameter.name: _numbers(parameter.get_value())})
                 check_going_on(self._fmu, asked, self.held)
             except InputError as error:

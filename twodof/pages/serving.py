@@ -81,7 +81,7 @@ class Server:
         url: URL of the page.
 
     Raises:
-        PageError: the port is in use, or the host is no address of this machine.
+        PageError: the port is in use, or the host is not an address of this machine.
     """
 
     def __init__(

@@ -235,7 +235,7 @@ def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
     except ValueError:
         read = {"ratio": math.inf}
     if not all(abs(value) <= LARGEST for value in read.values()):
-        raise RobotError(f"joint '{name}': its <mimic> has a factor or offset that is no number")
+        raise RobotError(f"joint '{name}': its <mimic> has a factor or offset that is not a number")
     if mimic.get("joint") == name:
         raise RobotError(f"joint '{name}' mimics itself")
     return {"leader": mimic.get("joint", ""), **read}

@@ -64,7 +64,7 @@ def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
     """Deserialise a message of a type, of limited size.
 
     Raises:
-        CommandError: the untrusted bytes are no message of the type.
+        CommandError: the untrusted bytes are not a message of the type.
     """
     try:
         if len(cdr) > most:

@@ -191,7 +191,7 @@ def _inputs_at(fmu: Fmu, t: float, asked: Mapping[str, Setting]) -> dict[str, Va
     values = resolve(fmu, asked)
     for name in values:
         if fmu.variables[name].causality != "input":
-            raise InputError(f"{name} is no input and cannot be changed at {t:g} s")
+            raise InputError(f"{name} is not an input and cannot be changed at {t:g} s")
     return values
 
 
@@ -210,7 +210,7 @@ def _steps(start: float, stop: float, h: float) -> float:
     if abs(steps * h - (stop - start)) > TIME_TOLERANCE * h * max(1, steps):
         fitting, last = (stop - start) / max(1, steps), start + max(1, steps) * h
         remedy = f"take steps of {fitting:.9g} s, or end at {last:.9g} s"
-        raise InputError(f"the run of {stop - start:g} s is no whole number of steps of {h:g} s; {remedy}")
+        raise InputError(f"the run of {stop - start:g} s is not a whole number of steps of {h:g} s; {remedy}")
     return steps
 
 

@@ -57,7 +57,7 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
     """Read an expression of known names: a condition such as "error > 1e-3", or a value such as "settling + overshoot".
 
     Raises:
-        InputError: the text is no such expression, or has an unknown name.
+        InputError: the text is not such an expression, or has an unknown name.
     """
     known = tuple(known)
     try:
@@ -76,7 +76,7 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
             begun = [each for each in known if each.startswith(name)]
             hint = f"did you mean {' or '.join(begun or near)}?" if begun or near else f"there are: {', '.join(known)}"
-            raise InputError(f"'{text:.100}': there is no number '{name:.50}'; {hint}")
+            raise InputError(f"'{text:.100}': there is not a number '{name:.50}'; {hint}")
     full = {name: full_name(name, known) for name in names}
 
     def evaluate(values: Values) -> Any:

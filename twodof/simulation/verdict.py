@@ -136,7 +136,7 @@ class Verdict:
         A condition on an undefined number, for example without a target, counts as one that holds.
 
         Raises:
-            InputError: a condition is no comparison of a verdict's numbers.
+            InputError: a condition is not a comparison of a verdict's numbers.
         """
         for condition in [expression(text, RESULTS, condition=True) for text in conditions]:
             unknown = [name for name in condition.names if name not in self.numbers]

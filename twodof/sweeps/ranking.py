@@ -61,7 +61,7 @@ def cost_of(text: str | None) -> Expression | None:
     """Return the expression of a cost of metrics, such as "settling + 0.1*peak_effort"; None for None.
 
     Raises:
-        InputError: the text is no such expression.
+        InputError: the text is not such an expression.
     """
     return None if text is None else expression(text, METRICS, condition=False)
 

@@ -117,7 +117,7 @@ class Results:
 
     def _taken(self) -> SweepError:
         known = self.path.is_dir() and _files(self.path)
-        what = "exists; resume it with `resume=True`, or" if known else "exists and is no sweep;"
+        what = "exists; resume it with `resume=True`, or" if known else "exists and is not a sweep;"
         return SweepError(f"'{self.path}' {what} choose another `output`")
 
     def _resume(self, provenance: dict[str, object]) -> None:
@@ -132,7 +132,7 @@ class Results:
             number = PART.fullmatch(file.name)
             self._part = int(number[1]) + 1 if number else 1
         if not self._part:
-            raise SweepError(f"'{self.path}' is no sweep; there is nothing to resume")
+            raise SweepError(f"'{self.path}' is not a sweep; there is nothing to resume")
 
     def add(self, rows: Iterable[Row]) -> None:
         """Add rows, stored within a second or two."""
