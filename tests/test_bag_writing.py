@@ -124,6 +124,24 @@ def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one
     assert not any(file for folder in tmp_path.iterdir() if folder != keep for file in folder.iterdir())
 
 
+@pytest.mark.parametrize("name", [".", "../bag", "../../work/bag"])
+def test_a_bag_with_the_working_directory_in_it_is_not_overwritten(run, tmp_path, monkeypatch, name):
+    path = tmp_path / "work" / "bag"
+    written(run, path, 5)
+    monkeypatch.chdir(path)
+    with pytest.raises(BagError, match="has the working directory in it"):
+        twodof.Bag(name, overwrite=True)
+    assert [*path.parent.iterdir()] == [path] and assert_consistent(path, "mcap") == 5
+
+
+@pytest.mark.parametrize("name", ["bag/../bag", "./bag/", "bag/."])
+def test_a_bag_is_overwritten_by_any_of_its_paths(run, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    written(run, Path("bag"), 5)
+    written(run, Path(name), 3, overwrite=True)
+    assert [*tmp_path.iterdir()] == [tmp_path / "bag"] and assert_consistent(tmp_path / "bag", "mcap") == 3
+
+
 def test_a_run_that_fails_before_its_first_sample_restores_the_bag_that_it_would_replace(run, tmp_path):
     path = tmp_path / "bag"
     written(run, path, 5)

@@ -26,7 +26,7 @@ class OldBag:
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
-        self._path, self._kept = path, path.with_name(path.name + REPLACED)
+        self._path, self._kept = path, path.parent / f"{path.name}{REPLACED}"
         self._locks: list[int] = []
         if (held := _hold(path, overwrite)) is None:
             return
@@ -75,6 +75,8 @@ def _hold(path: Path, overwrite: bool) -> int | None:
         if not overwrite:
             reason = "exists already; choose another with `path` or give `overwrite=True`"
             raise BagError(f"'{path}' {reason}")
+        if Path.cwd().is_relative_to(path.resolve()):  # a relative path would end elsewhere
+            raise BagError(f"'{path}' has the working directory in it and is not overwritten")
         held = lock(path)
     except BlockingIOError as error:
         reason = "is being written by another process and is not overwritten"

@@ -57,7 +57,7 @@ class Store:
             raise BagError(f"`compress` '{compress}' is unknown; there is: zstd")
         if compress and storage != "mcap":
             raise BagError(f"`compress` applies to storage mcap only, not to {storage}")
-        if os.path.islink(path):  # the link stays
+        if os.path.islink(path) or path != Path(os.path.normpath(path)):  # the link stays; bag/../bag is bag
             with refusing(BagError, f"write '{path}'"):
                 path = target_of(path)
         check_path(path, storage)
