@@ -420,3 +420,17 @@ with twodof.Bag(path, storage=storage, fsync=fsync == "True").begin(run) as bag:
     wanted = {file, file.parent, tmp_path, file.parent / "run.json"}
     assert {str(path) for path in wanted} <= synced[True]
     assert synced[False] == set()
+
+
+def test_a_run_killed_twice_before_its_first_sample_leaves_the_old_bag(run, tmp_path):
+    path = tmp_path / "bag"
+    written(run, path, 5)
+    killed = (
+        "import os, sys, twodof\nrun = twodof.experiment(sys.argv[1])\n"
+        "with twodof.Bag(sys.argv[2], overwrite=True).begin(run): os.kill(os.getpid(), 9)"
+    )
+    for _ in range(2):
+        assert python("-c", killed, run.fmu.path, path, cwd=HERE).returncode == -9
+    assert len(twodof.read_bag(tmp_path / "bag.replaced").t) == 5
+    written(run, path, 3, overwrite=True)
+    assert [*tmp_path.iterdir()] == [path] and assert_consistent(path, "mcap") == 3

@@ -27,14 +27,16 @@ class OldBag:
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self._path, self._kept = path, path.parent / f"{path.name}{REPLACED}"
+        self._left: list[Path] = []  # by runs that were killed
         self._locks: list[int] = []
         if (held := _hold(path, overwrite)) is None:
             return
         self._locks.append(held)
         try:
-            left = _hold(self._kept, overwrite)  # by a run that was killed
-            self._locks += [] if left is None else [left]
-            _remove(self._kept)
+            while (left := _hold(self._kept, overwrite)) is not None:
+                self._locks.append(left)
+                self._left.append(self._kept)
+                self._kept = path.parent / f"{self._kept.name}{REPLACED}"
             path.rename(self._kept)
         except OSError as error:
             self._release()
@@ -53,7 +55,8 @@ class OldBag:
         """Remove the old bag; if this fails, the next run that overwrites removes it."""
         if self._locks:
             with suppress(OSError):
-                _remove(self._kept)
+                for bag in (self._kept, *self._left):
+                    _remove(bag)
             self._release()
 
     def _release(self) -> None:
