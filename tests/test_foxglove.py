@@ -215,3 +215,17 @@ def test_it_listens_on_the_loopback_interface_alone(native_path):
         listening = Path("/proc/net/tcp").read_text().splitlines()[1:]
         (address,) = [line.split()[1] for line in listening if f":{port:04X} 00000000" in line]
         assert address.startswith("0100007F:")
+
+
+def test_a_port_is_free_if_the_server_behind_it_does_not_start(native_path, monkeypatch):
+    def failing(**options: object) -> None:
+        raise RuntimeError("no server")
+
+    with closing(socket.create_server(("127.0.0.1", 0))) as one:
+        port = one.getsockname()[1]
+    monkeypatch.setattr("twodof.pages.foxglove.start_server", failing)
+    sink = Foxglove(port).begin(twodof.experiment(native_path))
+    with pytest.raises(PublishError, match="cannot serve Foxglove: no server"):
+        sink.__enter__()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), 5)

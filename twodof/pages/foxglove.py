@@ -26,7 +26,7 @@ from ..simulation.input_values import Value, check_going_on, resolve
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
 from ..version import needing
-from .serving import HOST, Connection, Server, lock_port, relay
+from .serving import HOST, Server, lock_port, relay
 
 with needing(PublishError, "serve Foxglove", "foxglove"):
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -91,7 +91,6 @@ class Foxglove(Sink):
         hidden = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
         private, key = self._set_gains, secrets.token_bytes(32)
         try:
-            self._door = Server(None, HOST, self._port, self._talk, origins=APPS, protocol=PROTOCOL, private=private)
             self._server = start_server(
                 name="twodof",
                 host=hidden,
@@ -100,14 +99,18 @@ class Foxglove(Sink):
                 capabilities=[Capability.Parameters],
                 server_listener=self._gains,
             )
-            address = hidden, self._server.port
-            locked = lock_port(address, key)
-            if private and sys.platform == "linux" and os.geteuid() and not locked:
+            try:
+                address = hidden, self._server.port
+                locked = lock_port(address, key)
+                if private and sys.platform == "linux" and os.geteuid() and not locked:
+                    raise OSError(
+                        "this kernel has no TCP_MD5SIG, so other users could set gains: leave out `set_gains=True`"
+                    )
+                talk = partial(relay, address, key if locked else b"")
+                self._door = Server(None, HOST, self._port, talk, origins=APPS, protocol=PROTOCOL, private=private)
+            except BaseException:
                 self._server.stop()
-                raise OSError(
-                    "this kernel has no TCP_MD5SIG, so other users could set gains: leave out `set_gains=True`"
-                )
-            self._relay = partial(relay, address, key if locked else b"")
+                raise
         except (RuntimeError, OSError, PageError) as error:
             raise PublishError(f"cannot serve Foxglove: {error}") from error
         self._door.__enter__()
@@ -131,9 +134,6 @@ class Foxglove(Sink):
     def command(self, stop: Callable[[], bool] = never, pace: RealTime | None = None) -> dict[str, Value]:
         """Return the gains that were set since the last call, as inputs of the FMU."""
         return self._gains.take()
-
-    async def _talk(self, connection: Connection) -> None:
-        await self._relay(connection)
 
     def __exit__(self, *exception: object) -> None:
         self._door.__exit__(*exception)
