@@ -2,15 +2,17 @@
 
 import csv
 import json
+import tracemalloc
 
 import duckdb
 import numpy as np
 import pandas
 import pytest
+from bags import joint_message, write_third_party
 from failures import fmu_of
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import Reader, StoragePlugin
 
 import twodof
 from twodof.cli.main import main
@@ -120,6 +122,16 @@ def test_what_cannot_be_exported_is_refused(name, message, bag_path, tmp_path):
     with pytest.raises(twodof.TwoDofError, match=message):
         twodof.export_bag(bag_path, tmp_path / name)
     assert not [*tmp_path.iterdir()]
+
+
+def test_an_mcap_file_is_written_without_the_bag_in_memory(tmp_path):
+    states = (("/joint_states", k, joint_message(k, [*map(str, range(5000))], np.arange(5000))) for k in range(600))
+    bag = write_third_party(tmp_path / "bag", states, storage_plugin=StoragePlugin.MCAP)
+    tracemalloc.start()
+    path = twodof.export_bag(bag, tmp_path / "out.mcap")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 0.5 * path.stat().st_size
 
 
 def test_an_export_does_not_replace_a_file_of_its_bag(bag_path, tmp_path):

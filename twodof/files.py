@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
@@ -162,7 +162,7 @@ def _within_directory(size: int | None) -> int | None:
     return size
 
 
-def write_file(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file atomically, following links; or write into a device, pipe or /dev/stdout; or raise OSError.
 
     The umask sets the mode of a new file; a replaced file keeps its mode.
@@ -172,7 +172,7 @@ def write_file(path: Path, content: bytes) -> None:
         mode = os.stat(path).st_mode
     if descriptor is not None or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):
         with open(path if descriptor is None else os.dup(descriptor), "wb") as file:
-            file.write(content)
+            file.writelines([content] if isinstance(content, bytes) else content)
         return
     if mode:
         check_file(path, sys.maxsize)
@@ -182,7 +182,7 @@ def write_file(path: Path, content: bytes) -> None:
         with open(new, "wb") as file:
             if mode:
                 os.fchmod(new, stat.S_IMODE(mode) & 0o777)
-            file.write(content)
+            file.writelines([content] if isinstance(content, bytes) else content)
         os.replace(partial, target)
     except BaseException:
         partial.unlink(missing_ok=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from ..bounds import MIB
 from ..errors import BagError, path_of
 from ..files import refusing, temporary_folder, write_file
 from ..plant.urdf import RobotError, read_urdf
@@ -49,7 +51,7 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     if len(bags) > 1:
         raise BagError(f"'{path}' has one bag; several become the episodes of a folder that ends in .lerobot")
     if path.suffix == ".mcap":
-        content = _mcap(bags[0])
+        content: bytes | Iterable[bytes] = _mcap(bags[0])
     else:
         columns = _columns(read_bag(bags[0]))
         content = _csv(columns) if path.suffix == ".csv" else _parquet(columns)
@@ -92,7 +94,7 @@ def _parquet(columns: dict[str, tuple[str, Array]]) -> bytes:
         return bytes(table.to_parquet(index=False))
 
 
-def _mcap(bag: Path) -> bytes:
+def _mcap(bag: Path) -> Iterator[bytes]:
     folder, _ = robot_in(bag)
     whole_bag(folder)
     with temporary_folder() as temporary:
@@ -100,4 +102,5 @@ def _mcap(bag: Path) -> bytes:
         if damage:
             raise BagError(f"cannot export '{bag}': {damage}; 'twodof recover {folder}' saves what can be read")
         (file,) = storage_files(temporary / "bag")
-        return file.read_bytes()
+        with file.open("rb") as whole:
+            yield from iter(partial(whole.read, MIB), b"")
