@@ -15,6 +15,7 @@ from mcap.writer import Writer
 
 import twodof
 from twodof.bag.contents import read_messages
+from twodof.bag.mcap import CHANNEL
 from twodof.bag.reader import read_ends
 from twodof.bag.records import ReadBudget
 from twodof.bag.summary import read_summary
@@ -118,6 +119,20 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
     content = bytearray(file.read_bytes())
     start, place = statistics_of(content)
     content[place + 9 + field] ^= 1
+    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
+    file.write_bytes(content)
+    assert read_summary(file) is None
+
+
+def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(bag):
+    """With a checksum that is right, and a channel of another number."""
+    file = file_of(bag)
+    content = bytearray(file.read_bytes())
+    start, _ = statistics_of(content)
+    place = start
+    while content[place] != CHANNEL:
+        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
+    content[place + 9] ^= 0xFF
     content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
     file.write_bytes(content)
     assert read_summary(file) is None

@@ -126,4 +126,4 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
         return None
     indexed = frozenset().union(*(chunk.channels for chunk in chunks))
     used = {number: count for number, count in counts.items() if count}
-    return McapSummary(path, tables.channels, used, chunks) if used.keys() <= indexed else None
+    return McapSummary(path, tables.channels, used, chunks) if used.keys() <= indexed & tables.channels.keys() else None
