@@ -121,6 +121,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         q[:, 1] = 0.3 + 1e-4 * np.random.default_rng(0).normal(size=len(q))
     elif change == "nan":
         q[700, 1] = np.nan
+    elif change == "huge":
+        q[700, 1] = 1e300
     elif change == "millinewton":
         effort = 1000.0 * effort
     elif change == "repeated":
@@ -141,6 +143,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("short", "is too short"),
         ("still", "joint 'joint2' never moves"),
         ("nan", "the position of joint 'joint2' at 7 s is not a number"),
+        ("huge", "the position of joint 'joint2' at 7 s is beyond 1e+100"),
         ("millinewton", "a factor of 1000"),
         ("repeated", "several joint states at one time"),
         ("set back", "was the clock set back"),

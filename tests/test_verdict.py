@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from failures import FAILURES, ROBOTS, Failure, fmu_of, good_runs
 from page_causes import page_causes
+from recordings import third_party_bag
 from scipy.optimize import brute, differential_evolution
 from scipy.spatial.transform import Rotation
 from sinks import Memory
@@ -425,3 +426,24 @@ def test_a_joint_sticks_from_its_last_motion_on() -> None:
     assert "'joint1' sticks: its friction of 0.05 N·m stops it short" in creeping.verdict.lines[0]
     freed = twodof.simulate(fmu, settings={**settings, "friction": 0.0, "Kd": 10.0}, stop_time=5.0).verdict
     assert freed.outcome == "reached" and not freed.causes
+
+
+SWING = np.sin(np.arange(200) / 10)
+REPEATED = 0.01 * np.r_[0:50, 49, 50:199]
+OTHERS = {
+    "repeated stamp": (REPEATED, SWING, "oscillating"),
+    "one stamp": (np.zeros(200), SWING, "steady"),
+    "one message": (np.zeros(1), SWING[:1], "steady"),
+    "huge": (0.01 * np.arange(200), 1.7e308 * (-1.0) ** np.arange(200), "diverging"),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("velocities", [False, True])
+@pytest.mark.parametrize("form", OTHERS)
+def test_bags_of_others_with_odd_stamps_and_numbers_are_judged_without_a_warning(form, velocities, tmp_path):
+    t, q, motion = OTHERS[form]
+    q = np.column_stack([q, np.zeros(len(q))])
+    bag = third_party_bag(tmp_path / "bag", ["a", "b"], t, q, np.zeros_like(q) if velocities else None)
+    verdict = twodof.read_bag(bag).verdict
+    assert verdict.motion == motion and "nan" not in " ".join(verdict.lines)

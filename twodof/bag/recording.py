@@ -210,12 +210,17 @@ class Recording:
 
     def _judged(self, setup: Setup, x: Array, target: Array) -> Verdict:
         none, shape = np.empty((len(self.t), 0)), self.q.shape
+        new = np.append(True, np.diff(self.stamps) > 0)  # two states at one time have no velocity between them
         targets = {"x": target, "quat": self.target_quat if x.size else none, "q": self.held("q_des", shape[1])}
         quat = setup.orientations(self.q) if targets["quat"].size else none
-        with np.errstate(invalid="ignore"):  # third-party positions may not be finite
-            v = self.v if self.v.shape == shape else np.gradient(self.q, self.t, axis=0)
+        if (v := self.v).shape != shape:
+            v = np.zeros(shape)
+            if new.sum() > 1:
+                with np.errstate(invalid="ignore", over="ignore"):  # third-party positions may not be finite
+                    v[new] = np.gradient(self.q[new], self.t[new], axis=0)
         values = {"q": self.q, "v": v, "x": x, "tau": self.tau if self.tau.shape == shape else none, "quat": quat}
-        return judged(setup, self.t, values, {name: each for name, each in targets.items() if each.size})
+        samples = {name: each[new] for name, each in values.items()}
+        return judged(setup, self.t[new], samples, {name: each[new] for name, each in targets.items() if each.size})
 
     @cached_property
     def x(self) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bag.recording import Recording
+from ..bounds import MAX_VALUE
 from ..errors import InputError, choice
 from ..plant.robot import Robot
 
@@ -167,10 +168,11 @@ def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
     order = [own.index(joint) for joint in robot.joints]
     q, tau = recording.q[:, order], recording.tau[:, order]
     for values, what in ((q, "position"), (tau, "effort")):
-        if bad := np.argwhere(~np.isfinite(values)).tolist():
+        if bad := np.argwhere(~(np.abs(values) <= MAX_VALUE)).tolist():
             k, i = bad[0]
             where = f"joint '{robot.joints[i]}' at {recording.t[k]:g} s"
-            raise InputError(f"'{name}': the {what} of {where} is not a number")
+            fault = f"beyond {MAX_VALUE:g}" if np.isfinite(values[k, i]) else "not a number"
+            raise InputError(f"'{name}': the {what} of {where} is {fault}")
     return q, tau
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..bounds import MAX_VALUE
 from ..files import NUMBER
 from .cause import FLOOR, MANY_CHANGES, Cause
 from .causes import causes
@@ -187,13 +188,16 @@ def judged(setup: Setup, t: Array, values: Mapping[str, Array], targets: Mapping
     """
     rows = np.hstack([values[name] for name in OUTPUTS])
     known = np.isfinite(np.hstack([*targets.values(), np.zeros((len(t), 1))])).all(axis=1)
-    finite = np.isfinite(rows).all(axis=1)
+    finite = (np.abs(rows) <= MAX_VALUE).all(axis=1)
     first, end = int(known.argmax()), len(t) if finite.all() else int(finite.argmin())
     judge = Judge(setup, [values[name].shape[1] for name in OUTPUTS])
     for k in range(first, end, BLOCK):
         part = slice(k, min(k + BLOCK, end))
         judge.judge(t[part], rows[part], {name: target[part] for name, target in targets.items()})
-    lost = () if finite.all() else (Cause("diverged", f"a value is not finite at {t[end]:.4g} s", time=float(t[end])),)
+    lost: tuple[Cause, ...] = ()
+    if not finite.all():
+        what = f"beyond {MAX_VALUE:g}" if np.isfinite(rows[end]).all() else "not finite"
+        lost = (Cause("diverged", f"a value is {what} at {t[end]:.4g} s", time=float(t[end])),)
     if not judge.count:
         return Verdict("no target", "diverging", 0, 0.0, {}, lost, tuple(f"no target; {cause.text}" for cause in lost))
     return conclude(judge, lost)
