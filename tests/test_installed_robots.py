@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pinocchio as pin
 import pytest
 
@@ -79,3 +80,23 @@ def test_a_robot_that_is_unknown_is_refused(capsys):
     assert main(["build", "arm.urdf", "--robot", "panda"]) == 2
     with pytest.raises(twodof.TwoDofError, match="q_start: there is no joint 'joint3'; did you mean 'joint2'"):
         twodof.build_fmu("new.fmu", twodof.FmuOptions(q_start={"joint3": 1.0}))
+
+
+def test_a_home_pose_outside_of_the_limits_is_the_same_pose_within_them():
+    path, home = stock_robots()["kinova"], twodof.stock_robot("kinova").q_start
+    assert isinstance(home, dict)
+    model = pin.buildModelFromUrdf(str(path))
+    pin.loadReferenceConfigurations(model, str(path.parents[1] / "srdf/kinova.srdf"))
+    reference = model.referenceConfigurations["arm_up"]
+    q = reference.copy()
+    for name, value in home.items():
+        joint = model.joints[model.getJointId(name)]
+        q[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
+    assert (model.lowerPositionLimit <= q).all() and (q <= model.upperPositionLimit).all()
+    assert not (model.lowerPositionLimit <= reference).all()
+    placements = []
+    for each in (q, reference):
+        data = model.createData()
+        pin.forwardKinematics(model, data, each)
+        placements.append(np.array(data.oMi[model.njoints - 1]))
+    np.testing.assert_allclose(placements[0], placements[1], atol=1e-12)

@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
+from math import tau
 from pathlib import Path
 
 from ..errors import BuildError, choice
@@ -99,5 +100,7 @@ def _home(semantics: ET.Element, urdf: Urdf) -> dict[str, float]:
         joint = urdf.joints.get(str(element.get("name")))
         with suppress(ValueError):  # a floating base has several values
             if joint is not None and joint.moves and joint.leader == joint.name:
-                home[joint.name] = float(str(element.get("value")))
+                home[joint.name] = value = float(str(element.get("value")))
+                if joint.type == "revolute" and not joint.low <= value <= joint.high:  # a full turn is the same pose
+                    home[joint.name] += tau * round((0.5 * (joint.low + joint.high) - value) / tau)
     return home
