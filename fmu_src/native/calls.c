@@ -5,7 +5,7 @@ static const char *const PHASE_NAME[N_PHASES] = {
     "instantiated", "initialization mode", "step mode", "step failed", "event mode",
     "continuous-time mode", "terminated"};
 
-static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation"};
+static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation", IS_CLOCKED ? "event mode" : "Model Exchange"};
 
 #define PHASE(phase) (1 << (phase))
 
@@ -16,7 +16,7 @@ enum {
     ANY = PHASE(INSTANTIATED) | READS,
     GETS = FMI == 3 ? ANY : READS,
     SETS = PHASE(INSTANTIATED) | PHASE(INITIALIZATION) | PHASE(STEP) | PHASE(EVENT) | PHASE(CONTINUOUS_TIME),
-    ENTERS = PHASE(CONTINUOUS_TIME) | (FMI == 3 ? 0 : PHASE(EVENT)),
+    ENTERS = PHASE(CONTINUOUS_TIME) | (FMI == 3 ? PHASE(STEP) : PHASE(EVENT)),
     SOLVES = PHASE(INITIALIZATION) | PHASE(EVENT) | PHASE(CONTINUOUS_TIME) | PHASE(TERMINATED)
 };
 
@@ -54,8 +54,13 @@ static const struct {
     [SIZE_OF_STATE] = {CALL_NAME(SerializedFMUstateSize), ANY, BOTH_KINDS},
     [SERIALIZE] = {CALL_NAME(SerializeFMUstate), ANY, BOTH_KINDS},
     [DESERIALIZE] = {CALL_NAME(DeSerializeFMUstate), ANY, BOTH_KINDS},
-    [ENTER_EVENT_MODE] = {CALL_NAME(EnterEventMode), ENTERS, MODEL_EXCHANGE},
-    [NEW_DISCRETE_STATES] = {CALL_NAME(NewDiscreteStates), PHASE(EVENT), MODEL_EXCHANGE},
+    [ENTER_EVENT_MODE] = {CALL_NAME(EnterEventMode), ENTERS, EVENT_MODE},
+    [NEW_DISCRETE_STATES] = {CALL_NAME(NewDiscreteStates), PHASE(EVENT), EVENT_MODE},
+    [ENTER_STEP_MODE] = {CALL_NAME(EnterStepMode), PHASE(EVENT), CO_SIMULATION},
+    [GET_CLOCK] = {CALL_NAME(GetClock), PHASE(EVENT), EVENT_MODE},
+    [SET_CLOCK] = {CALL_NAME(SetClock), PHASE(EVENT), EVENT_MODE},
+    [GET_INTERVAL] = {CALL_NAME(GetInterval), READS, BOTH_KINDS},
+    [SET_INTERVAL] = {CALL_NAME(SetIntervalDecimal), PHASE(INITIALIZATION), BOTH_KINDS},
     [ENTER_CONTINUOUS_TIME_MODE] = {CALL_NAME(EnterContinuousTimeMode), PHASE(EVENT), MODEL_EXCHANGE},
     [COMPLETED_INTEGRATOR_STEP] = {CALL_NAME(CompletedIntegratorStep), PHASE(CONTINUOUS_TIME), MODEL_EXCHANGE},
     [SET_TIME] = {CALL_NAME(SetTime), PHASE(EVENT) | PHASE(CONTINUOUS_TIME), MODEL_EXCHANGE},
@@ -75,11 +80,14 @@ static const char *call_name(Call call)
     return RULE[call].name;
 }
 
-/* True if an instance of a kind can be in a phase. */
-static int can_be_in(Kind kind, int phase)
+/* True if an instance of this kind can have the phase and the clock of a state. */
+static int can_have(const Instance *instance, const State *state)
 {
-    const int other = kind == MODEL_EXCHANGE ? PHASE(STEP) | PHASE(STEP_FAILED) : PHASE(EVENT) | PHASE(CONTINUOUS_TIME);
-    return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
+    const int phase = state->phase, event = instance->has_clock ? 0 : PHASE(EVENT);
+    const int other = instance->kind == MODEL_EXCHANGE ? PHASE(STEP) | PHASE(STEP_FAILED)
+                                                       : PHASE(CONTINUOUS_TIME) | event;
+    return phase >= 0 && phase < N_PHASES && !(other >> phase & 1)
+           && (state->sampling.clock != NO_CLOCK) == instance->has_clock;
 }
 
 /* True if a call is allowed in the instance's phase; log a refusal. */
@@ -87,7 +95,9 @@ static int allowed(Instance *instance, Call call, const char *culprit)
 {
     const int phase = instance->state.phase;
     const Kind kind = RULE[call].kind;
-    if (kind != BOTH_KINDS && kind != instance->kind) {
+    const int is_of_kind = kind == EVENT_MODE ? instance->kind == MODEL_EXCHANGE || instance->has_clock
+                                              : kind == BOTH_KINDS || kind == instance->kind;
+    if (!is_of_kind) {
         report(instance, ERROR, "%s is a call of %s, and the instance is one of %s",
                call_name(call), KIND_NAME[kind], KIND_NAME[instance->kind]);
         return 0;

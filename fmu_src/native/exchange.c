@@ -30,6 +30,25 @@ static Instance *enter_with(void *component, Call call, const void *values, size
     return instance;
 }
 
+static const char CLOCK_NAME[] = "control_clock"; /* of an FMU that is clocked */
+
+/* Refuse a call that leaves out the next tick or comes before it. */
+static Status off_tick(Instance *instance, Call call, double tick)
+{
+    return report(instance, ERROR, "%s: %s ticks next at %.12g s, and the time is %.12g s; tick it in event mode at"
+                  " that time, or instantiate without event mode", call_name(call), CLOCK_NAME, tick,
+                  instance->state.time);
+}
+
+/* True unless a tick is due that the importer has left out. */
+static int has_ticked(Instance *instance, Call call)
+{
+    const State *state = &instance->state;
+    const double tick = instant(&state->sampling, &state->plant, state->sampling.k);
+    return state->sampling.clock == NO_CLOCK || tick > state->time + slack(&state->plant, state->time)
+           || off_tick(instance, call, tick) == OK;
+}
+
 /* Report whether the states q and v changed, and the time of the next time event, HUGE_VAL if there is none. */
 static Status update_discrete_states(void *component, Boolean *states_changed, double *next_event)
 {
@@ -50,6 +69,8 @@ static Status update_discrete_states(void *component, Boolean *states_changed, d
             return report(instance, ERROR, "%s: %s would not be finite",
                           call_name(NEW_DISCRETE_STATES), VARIABLE_NAME[Q + i]);
     draft.has_x = draft.has_tau = draft.has_rates = 0;
+    if (draft.sampling.clock == ACTIVE)
+        draft.sampling.clock = INACTIVE;
     instance->state = draft;
     *next_event = next_sampling_event(&draft.sampling, &draft.plant);
     *states_changed = changed;
@@ -63,9 +84,11 @@ Status STANDARD(EnterEventMode)(void *component)
 
 Status STANDARD(EnterContinuousTimeMode)(void *component)
 {
-    if (move_on(component, ENTER_CONTINUOUS_TIME_MODE, CONTINUOUS_TIME) != OK)
+    Instance *instance = enter(component, ENTER_CONTINUOUS_TIME_MODE, 1);
+    if (!instance || !has_ticked(instance, ENTER_CONTINUOUS_TIME_MODE))
         return ERROR;
-    State *state = &((Instance *)component)->state;
+    State *state = &instance->state;
+    state->phase = CONTINUOUS_TIME;
     if (IS_CONTROLLER)
         return OK;
     update_rates(state);

@@ -18,11 +18,11 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
 {
     (void)resources, (void)visible, (void)early_return, (void)required, (void)intermediate_update;
     Instance draft = {.kind = CO_SIMULATION, .log = (void (*)(void))log,
-                      .environment = environment, .name = name};
-    if (!event_mode && n_required == 0)
+                      .environment = environment, .name = name, .has_clock = event_mode};
+    if ((!event_mode || IS_CLOCKED) && n_required == 0)
         return instantiate(draft, token, logging_on);
     report(&draft, ERROR, "fmi3InstantiateCoSimulation: this FMU has no %s",
-           event_mode ? "event mode in co-simulation" : "intermediate update");
+           event_mode && !IS_CLOCKED ? "event mode in co-simulation" : "intermediate update");
     return NULL;
 }
 
@@ -33,7 +33,8 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
 {
     (void)resources, (void)visible;
     return instantiate((Instance){.kind = MODEL_EXCHANGE, .log = (void (*)(void))log,
-                                  .environment = environment, .name = name}, token, logging_on);
+                                  .environment = environment, .name = name, .has_clock = IS_CLOCKED}, token,
+                       logging_on);
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolerance_defined,
@@ -86,6 +87,9 @@ fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference vr[], s
     return set_values(instance, SET_OTHER, vr, count, value, n_values);
 }
 
+#if IS_CLOCKED
+#include "clock.c"
+#else
 fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
                         fmi3Clock value[])
 {
@@ -97,6 +101,7 @@ fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference vr[], si
 {
     return set_values(instance, SET_OTHER, vr, count, value, count);
 }
+#endif
 
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknown[],
                                         size_t n_unknown, const fmi3ValueReference known[],
@@ -193,25 +198,27 @@ UNSUPPORTED(GetVariableDependencies,
 UNSUPPORTED(EnterConfigurationMode, (fmi3Instance instance))
 UNSUPPORTED(ExitConfigurationMode, (fmi3Instance instance))
 UNSUPPORTED(EvaluateDiscreteStates, (fmi3Instance instance))
-UNSUPPORTED(EnterStepMode, (fmi3Instance instance))
 UNSUPPORTED(GetOutputDerivatives,
             (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
              const fmi3Int32 orders[], fmi3Float64 value[], size_t n_values))
+#if !IS_CLOCKED
+UNSUPPORTED(EnterStepMode, (fmi3Instance instance))
 UNSUPPORTED(GetIntervalDecimal,
             (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
              fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[]))
-UNSUPPORTED(GetIntervalFraction,
-            (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
-             fmi3UInt64 counters[], fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]))
 UNSUPPORTED(GetShiftDecimal,
             (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
              fmi3Float64 shifts[]))
-UNSUPPORTED(GetShiftFraction,
-            (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
-             fmi3UInt64 counters[], fmi3UInt64 resolutions[]))
 UNSUPPORTED(SetIntervalDecimal,
             (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
              const fmi3Float64 intervals[]))
+#endif
+UNSUPPORTED(GetIntervalFraction,
+            (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
+             fmi3UInt64 counters[], fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]))
+UNSUPPORTED(GetShiftFraction,
+            (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
+             fmi3UInt64 counters[], fmi3UInt64 resolutions[]))
 UNSUPPORTED(SetIntervalFraction,
             (fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
              const fmi3UInt64 counters[], const fmi3UInt64 resolutions[]))

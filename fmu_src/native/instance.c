@@ -30,13 +30,15 @@ Status report(Instance *instance, Status status, const char *format, ...)
 }
 
 /* Set the state to that of a new instance. */
-static void reset_state(State *state)
+static void reset_state(Instance *instance)
 {
+    State *state = &instance->state;
     memset(state, 0, sizeof *state);
     memcpy(state->guid, MODEL_GUID, sizeof MODEL_GUID);
     memcpy(state->plant.value, START, sizeof START);
     state->stop_time = HUGE_VAL;
     state->phase = INSTANTIATED;
+    state->sampling.clock = instance->has_clock ? INACTIVE : NO_CLOCK;
 }
 
 /* Return OK if a variable may have a value; a refusal is logged. */
@@ -73,6 +75,8 @@ static Status check_sampling(Instance *instance)
     const double period = value[CONTROL_PERIOD], delay = value[CONTROL_DELAY];
     const int of_points = !COMMANDS_ACCELERATION && instance->kind == CO_SIMULATION;
     const int group[] = {Q_RESOLUTION, Q_NOISE, V_NOISE, V_FROM_Q};
+    if (IS_CLOCKED && period == 0.0)
+        return report(instance, ERROR, "control_period = 0, but a clock samples this controller; set it to more than 0");
     if (delay != 0.0 && period == 0.0)
         return report(instance, ERROR, "control_delay = %g needs a control_period > 0; set that, or leave"
                       " it out", delay);
@@ -128,7 +132,7 @@ static Status initialise(Instance *instance, int warn)
     }
     if (!IS_CONTROLLER)
         impact(&state->plant, &value[Q], anti_chatter);
-    state->sampling = (Sampling){.start = state->time, .time = state->time};
+    state->sampling = (Sampling){.start = state->time, .time = state->time, .clock = state->sampling.clock};
     for (int i = 0; i < N_JOINTS && value[CONTROL_PERIOD] != 0.0; i++)
         value[TAU + i] = 0.0;
     state->initialised = 1;
@@ -210,7 +214,7 @@ static Instance *instantiate(Instance draft, const char *token, int logging_on)
     for (int i = 0; i < N_JOINTS; i++)
         instance->slope[i][V + i] = 1.0;
     instance->name = strcpy((char *)(instance + 1) + matrix, name);
-    reset_state(&instance->state);
+    reset_state(instance);
     return instance;
 }
 
@@ -267,7 +271,7 @@ Status STANDARD(ExitInitializationMode)(void *component)
     Instance *instance = enter(component, EXIT_INITIALIZATION, 1);
     if (!instance || initialise(instance, 1) != OK)
         return ERROR;
-    instance->state.phase = instance->kind == MODEL_EXCHANGE ? EVENT : STEP;
+    instance->state.phase = instance->kind == MODEL_EXCHANGE || instance->has_clock ? EVENT : STEP;
     return OK;
 }
 
@@ -281,6 +285,6 @@ Status STANDARD(Reset)(void *component)
     Instance *instance = enter(component, RESET, 1);
     if (!instance)
         return ERROR;
-    reset_state(&instance->state);
+    reset_state(instance);
     return OK;
 }

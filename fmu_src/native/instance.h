@@ -59,12 +59,13 @@ typedef STANDARD(ValueReference) Reference;
 #define ERROR STANDARD(Error)
 
 /* These have the same numbers in all versions of FMI. */
-typedef enum { BOTH_KINDS, MODEL_EXCHANGE, CO_SIMULATION } Kind;
+typedef enum { BOTH_KINDS, MODEL_EXCHANGE, CO_SIMULATION, EVENT_MODE /* of either kind */ } Kind;
 
 typedef enum {
     INSTANTIATED, INITIALIZATION,
     STEP, STEP_FAILED,      /* in co-simulation */
-    EVENT, CONTINUOUS_TIME, /* in Model Exchange */
+    EVENT,                  /* in Model Exchange, or with a clock */
+    CONTINUOUS_TIME,        /* in Model Exchange */
     TERMINATED, N_PHASES
 } Phase;
 
@@ -100,6 +101,7 @@ typedef struct {
     const char *name;
     double (*slope)[X]; /* the Jacobian: derivatives of the states' rates with respect to inputs and states */
     int asks_several;   /* whether the last point had several directions */
+    int has_clock;      /* whether the importer ticks the clock */
     int silent; /* bit mask of the log categories that are off; 0 before instantiation */
 } Instance;
 
@@ -108,7 +110,8 @@ typedef enum {
     INSTANTIATE, SET_DEBUG_LOGGING, SETUP_EXPERIMENT, ENTER_INITIALIZATION, EXIT_INITIALIZATION,
     TERMINATE, RESET, DO_STEP, CANCEL_STEP, GET_STATUS, GET_REAL, GET_BOOLEAN, GET_INTEGER,
     GET_OTHER, SET_REAL, SET_BOOLEAN, SET_INTEGER, SET_OTHER, SET_INPUT, SET_PARAMETER, SET_Q_V, GET_STATE, SET_STATE, FREE_STATE,
-    SIZE_OF_STATE, SERIALIZE, DESERIALIZE, ENTER_EVENT_MODE, NEW_DISCRETE_STATES,
+    SIZE_OF_STATE, SERIALIZE, DESERIALIZE, ENTER_EVENT_MODE, NEW_DISCRETE_STATES, ENTER_STEP_MODE,
+    GET_CLOCK, SET_CLOCK, GET_INTERVAL, SET_INTERVAL,
     ENTER_CONTINUOUS_TIME_MODE, COMPLETED_INTEGRATOR_STEP, SET_TIME, SET_CONTINUOUS_STATES,
     GET_DERIVATIVES, GET_EVENT_INDICATORS, GET_CONTINUOUS_STATES, GET_NOMINALS,
     GET_DIRECTIONAL_DERIVATIVE, GET_ADJOINT_DERIVATIVE, COUNT_STATES, N_CALLS

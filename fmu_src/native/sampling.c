@@ -14,6 +14,9 @@
 
 enum { MOST_PERIODS = 10 }; /* longest delay */
 
+/* Who takes the samples: the FMU, or the importer with a clock, which is active while it ticks. */
+typedef enum { NO_CLOCK, INACTIVE, ACTIVE } Clock;
+
 /* Discrete state of the controller and its sensors. The acting effort is the plant's output tau. */
 typedef struct {
     double start;            /* t_0, s */
@@ -22,6 +25,8 @@ typedef struct {
     double q_meas[N_JOINTS]; /* the latest positions, for velocities by differences */
     double pending[MOST_PERIODS + 1][N_JOINTS]; /* efforts that do not act yet, the oldest first */
     int count;                                  /* number of pending efforts */
+    int clock;                                  /* a value of Clock */
+    double before[3][N_JOINTS];                 /* tau, q_meas and v_meas before the clock became active */
 } Sampling;
 
 /* Tolerances for equal times, relative to max(1 s, |t|) and to the period. */
@@ -50,7 +55,8 @@ static double next_sampling_event(const Sampling *sampling, const Plant *plant)
 {
     return plant->value[CONTROL_PERIOD] == 0.0
                ? HUGE_VAL
-               : fmin(instant(sampling, plant, sampling->k), due(sampling, plant));
+               : fmin(sampling->clock == NO_CLOCK ? instant(sampling, plant, sampling->k) : HUGE_VAL,
+                      due(sampling, plant));
 }
 
 static double rounded(double q, double resolution)
@@ -91,7 +97,7 @@ static int settle(Sampling *sampling, Plant *plant, double time)
         measure(sampling, plant, time);
         return 1;
     }
-    if (instant(sampling, plant, sampling->k) <= by) {
+    if (sampling->clock != INACTIVE && instant(sampling, plant, sampling->k) <= by) {
         const Sampling before = *sampling;
         /* samples that an importer's solver skipped are lost */
         sampling->k = fmax(sampling->k, fmin(ALL_WHOLE, floor((by - sampling->start) / period)));
@@ -160,9 +166,12 @@ static int is_sampling(const Sampling *sampling, const Plant *plant, double time
 {
     const double k = sampling->k, period = plant->value[CONTROL_PERIOD];
     int sound = isfinite(sampling->start) && isfinite(sampling->time) && k >= 0.0 && k < ALL_WHOLE && k == floor(k)
+                && sampling->clock >= NO_CLOCK && sampling->clock <= ACTIVE
                 && sampling->count >= 0 && sampling->count <= MOST_PERIODS && sampling->count <= k;
     for (int i = 0; i < N_JOINTS; i++) {
         sound = sound && isfinite(sampling->q_meas[i]) && (period == 0.0 || isfinite(plant->value[TAU + i]));
+        for (int j = 0; j < 3; j++)
+            sound = sound && isfinite(sampling->before[j][i]);
         for (int j = 0; j <= MOST_PERIODS; j++)
             sound = sound && isfinite(sampling->pending[j][i]);
     }

@@ -72,7 +72,7 @@ static Status take_over(Instance *instance, const void *bytes)
     State *state = &instance->state;
     const double *value = state->plant.value;
     memcpy(state, bytes, sizeof *state);
-    int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
+    int sound = can_have(instance, state) && isfinite(state->time)
                 && state->stop_time > -HUGE_VAL && are_whole(value)
                 && are_stops(&state->stops) && is_passage(&state->passage);
     const int runs = state->phase >= STEP; /* before the run, initialisation reports errors */
@@ -118,7 +118,7 @@ Status STANDARD(SetFMUstate)(void *component, void *saved)
         return ERROR;
     if (!is_own(saved))
         return refuse(instance, SET_STATE, FOREIGN);
-    if (!can_be_in(instance->kind, ((const State *)saved)->phase))
+    if (!can_have(instance, saved))
         return refuse(instance, SET_STATE, OTHER_KIND);
     memcpy(&instance->state, saved, sizeof(State));
     instance->state.has_rates &= RATES; /* the Jacobian is not saved */

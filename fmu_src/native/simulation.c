@@ -52,6 +52,10 @@ static Status do_step(void *component, double point, double h)
     if (point + h > state->stop_time && is_far(point + h, state->stop_time))
         return report(instance, ERROR, "%s: the step of %.12g s from %.12g s ends after"
                       " the stop time, %.12g s", call, h, point, state->stop_time);
+    const double tick = instant(&state->sampling, &state->plant, state->sampling.k);
+    if (state->sampling.clock != NO_CLOCK && tick < point + h - slack(&state->plant, point + h))
+        return report(instance, ERROR, "%s: the step of %.12g s from %.12g s passes the tick of the clock at %.12g s;"
+                      " end it there", call, h, point, tick);
     if (check_inputs(instance) != OK)
         return ERROR;
     Failure failure;

@@ -45,6 +45,8 @@ def add(build: Parser) -> None:
     option("--control", choices=("task", "joint", "effort"), default="task", help=text)
     text = "robot under its control law, or the control law alone, as a native FMU (%(default)s)"
     option("--part", choices=("all", "controller"), default="all", help=text)
+    text = "with --part controller and --fmi 3, an input clock for tools with event mode, which samples the controller"
+    flag("--clocked", help=text)
     text = "build plant and controller as two native FMUs, connected in an SSP file"
     option("--split", action="store_const", dest="part", const="split", help=text)
     text = "further outputs: mass matrix, nonlinear effects, Jacobian, or its drift"
@@ -144,7 +146,7 @@ def _build(options: argparse.Namespace) -> Path:
         arrays=not options.scalars,
         outputs=tuple(options.outputs),
         platforms=tuple(dict.fromkeys(platforms)),
-        **given_options(options, "axes", "link_environment", "native", "fmi", "reference", "part"),
+        **given_options(options, "axes", "link_environment", "native", "fmi", "reference", "part", "clocked"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     return build_fmu(options.output, chosen, overwrite=options.overwrite)

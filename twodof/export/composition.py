@@ -59,6 +59,8 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     robot, table, starts = _model(options, text)
     if options.part == "controller":
         table = controller_table(table)
+        if options.clocked and not next(v.start for v in table if v.group == "control_period"):
+            raise BuildError("the clock needs the controller's period in `settings`, as control_period = 0.005")
     urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
     flavour = _flavour(options, robot, table, urdf, starts)
     resources = {"robot.urdf": urdf.encode(), **meshes}

@@ -92,7 +92,7 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
     left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
     left_out |= set() if law == "task" else {"pseudo_inverse.c"}
     left_out |= set() if control == "pose" else {"orientation.c"}
-    left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c"}
+    left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c", "clock.c"}
     return {
         path.name: path.read_bytes() for path in data_file("fmu_src", "native").iterdir() if path.name not in left_out
     }
@@ -110,7 +110,7 @@ def native_flavour(
         sources |= {file: text for file, text in headers.items() if file.startswith("fmi2")}
 
     def header(guid: str) -> bytes:
-        return model_header(robot, table, control, guid, fmi, arrays).encode()
+        return model_header(robot, table, control, guid, fmi, arrays, options.clocked).encode()
 
     def signed(guid: str) -> Files:
         all_sources = {**headers, **sources, "model.h": header(guid)}

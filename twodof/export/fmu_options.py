@@ -33,6 +33,7 @@ class FmuOptions:
             frame), "joint" or "effort".
         part: "all"; "controller": the control law alone, native, with inputs q and v and outputs tau_cmd; or "split":
             a system of plant and controller, two native FMUs in an SSP file.
+        clocked: whether an importer with event mode samples a controller alone with an input clock (FMI 3).
         name: model name and identifier; "": name of the URDF's file, "TwoDof" for the shipped arm.
         link_environment: store the folders of this Python's packages in the FMU; not for the native
             flavour, which needs no Python.
@@ -57,6 +58,7 @@ class FmuOptions:
     settings: Mapping[str, object] = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
     part: str = "all"
+    clocked: bool = False
     name: str = ""
     link_environment: bool = False
     native: bool = False
@@ -89,6 +91,9 @@ class FmuOptions:
             raise BuildError("reference trajectories are of the robot under its control law; leave out `reference`")
         if self.part == "controller" and (not self.native or self.control == "effort"):
             raise BuildError("the controller alone is native, `native=True`, and has a control law other than 'effort'")
+
+        if self.clocked and (self.part != "controller" or self.fmi != 3):
+            raise BuildError("a clock samples the controller alone, in FMI 3: `part='controller'`, `fmi=3`")
 
     @property
     def is_default_arm(self) -> bool:

@@ -8,6 +8,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
@@ -91,7 +92,7 @@ def model_description(
         indicators = 0 if options.part == "controller" else count_event_indicators(robot, options.control)
         attributes["numberOfEventIndicators"] = str(indicators)
     root = ET.Element("fmiModelDescription", attributes)
-    _interfaces(root, options.name, flavour)
+    _interfaces(root, options.name, flavour, options.clocked)
     add_units(root, {variable.unit for variable in table}, fmi)
     categories = ET.SubElement(root, "LogCategories")
     for category, description in LOG_CATEGORIES.items():
@@ -101,6 +102,8 @@ def model_description(
         annotations = ET.SubElement(root, "VendorAnnotations")
         _describe(ET.SubElement(annotations, "Tool", name=VENDOR), robot, options.control)
     _variables(root, robot, table, names, references, flavour)
+    if options.clocked:
+        _clock(root, table, len(reference) + 1)
     _structure(root, robot, table, places, law, fmi)
     if fmi == 3:
         annotations = ET.SubElement(root, "Annotations")
@@ -108,7 +111,7 @@ def model_description(
     return xml_text(root)
 
 
-def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
+def _interfaces(root: ET.Element, identifier: str, flavour: Flavour, clocked: bool) -> None:
     two, native = flavour.fmi == 2, flavour.native
     state = "FMUstate" if two else "FMUState"
     flags = {f"canGetAndSet{state}": True, f"canSerialize{state}": True}
@@ -118,6 +121,8 @@ def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
     if native:
         flags["providesDirectionalDerivative" if two else "providesDirectionalDerivatives"] = True
     own = {"CoSimulation": {"canHandleVariableCommunicationStepSize": True}}
+    if clocked:
+        own["CoSimulation"]["hasEventMode"] = True
     if native:
         own = {"ModelExchange": {}, **own}
     for interface, more in own.items():
@@ -199,6 +204,21 @@ def _variables(
         if name != first.name:
             for size in (len(indices) // first.columns, first.columns) if first.columns else (len(indices),):
                 ET.SubElement(element, "Dimension", start=str(size))
+
+
+def _clock(root: ET.Element, table: Sequence[Variable], reference: int) -> None:
+    """Add the input clock, whose interval is the parameter control_period. FMI 3.0.2, sections 2.2.8 and 2.4.7.5."""
+    period = next(variable.start for variable in table if variable.name == "control_period")
+    attributes = {
+        "name": "control_clock",
+        "valueReference": str(reference),
+        "description": "ticks at each sample of the controller, first at the start time",
+        "causality": "input",
+        "variability": "discrete",
+        "intervalVariability": "fixed",
+        "intervalDecimal": repr(period),
+    }
+    ET.SubElement(cast(ET.Element, root.find("ModelVariables")), "Clock", attributes)
 
 
 def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges: bool) -> dict[str, str]:

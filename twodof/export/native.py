@@ -19,7 +19,13 @@ SIGNS = "change sign where a joint reaches or leaves a stop, or the rank of J⁺
 
 
 def model_header(
-    robot: Robot, table: Sequence[Variable], control: str, guid: str, fmi: int = 2, arrays: bool = True
+    robot: Robot,
+    table: Sequence[Variable],
+    control: str,
+    guid: str,
+    fmi: int = 2,
+    arrays: bool = True,
+    clocked: bool = False,
 ) -> str:
     """Return the text of ``model.h``: constants of a robot and its variables, bit-exact.
 
@@ -41,6 +47,7 @@ def model_header(
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         f"#define IS_CONTROLLER {int(is_controller)} /* the control law alone: q and v are inputs */\n"
+        f"#define IS_CLOCKED {int(clocked)} /* an importer with event mode ticks the samples */\n"
         + "".join(f"#define HAS_{group.upper()}\n" for group in ("rcond", *ON_REQUEST) if group in groups),
         _groups(groups, {**FIRST, "FIRST_OUTPUT": "x"} if is_controller else FIRST),
         _references(table, fmi == 3 and arrays),
@@ -95,7 +102,8 @@ def _references(table: Sequence[Variable], arrays: bool) -> str:
     indices = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
     return (
         "/* The values of a reference, from 1 on: from INDEX[vr] to before INDEX[vr + 1]. */\n"
-        f"enum {{ N_REFERENCES = {len(indices)} }};\n" + _table("int INDEX", [0, *indices, len(table)])
+        f"enum {{ N_REFERENCES = {len(indices)}, CLOCK = N_REFERENCES + 1 }};\n"
+        + _table("int INDEX", [0, *indices, len(table)])
     )
 
 
