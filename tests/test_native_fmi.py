@@ -311,14 +311,15 @@ def forged(arm, field, value):
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
     joints = len(arm.of.robot.joints)
-    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}di4x{3 * joints + 4}i6iQ")
+    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}d2i{3 * joints}d{3 * joints + 4}i6iQ")
     fields = list(layout.unpack(blob))
     names = ["time", "stop_time", "step_start"]
     names += [f"step_{kind}[{i + 1}]" for kind in ("q", "v", "a") for i in range(joints)]
     names += [f"reached_{state}[{i + 1}]" for state in "qv" for i in range(joints)]
     names += ["reached_at", "passed_by", "step_begun", "first_sample", "last_sample", "samples"]
     names += [f"sample[{i + 1}]" for i in range(joints)]
-    names += [f"pending{k}[{i + 1}]" for k in range(11) for i in range(joints)] + ["waiting"]
+    names += [f"pending{k}[{i + 1}]" for k in range(11) for i in range(joints)]
+    names += ["waiting", "clock"] + [f"before_{kind}[{i + 1}]" for kind in ("tau", "q", "v") for i in range(joints)]
     names += [f"{what}[{i + 1}]" for what in ("held", "watched", "slip") for i in range(joints)]
     names += ["any_held", "any_watched", "any_slip", "rank", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
@@ -355,6 +356,8 @@ FORGERIES = {
     "sample[2]": ((np.nan, np.inf), UNSOUND),
     "pending10[1]": ((np.nan, np.inf), UNSOUND),
     "waiting": ((1, -1, 11, 2**31 - 1), UNSOUND),  # where no controller is sampled
+    "clock": ((1, 2, -1, 3), UNSOUND),  # of an FMU without one
+    "before_v[2]": ((np.nan, np.inf), UNSOUND),
     "x_des[1]": ((np.nan, np.inf), UNSOUND),
     "seed": ((0.5, np.nan), UNSOUND),
     "integrator": ((0.5, np.nan), UNSOUND),
