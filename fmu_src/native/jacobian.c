@@ -182,6 +182,13 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
     divide_by_mass(all.M, stops, first, slope);
     if (cancels)
         add_command(value, stops, first, slope);
+    for (int k = Q - N_FREE; k < Q; k++) { /* by parameters that are inputs */
+        double change[X] = {0}, derivative[FIRST_PARAMETER];
+        change[k] = 1.0;
+        differentiate(value, stops->held, stops->slip, stops->rank, WANTS_RATES, change, derivative);
+        for (int i = 0; i < N_JOINTS; i++)
+            slope[i][k] = derivative[DER_V + i];
+    }
     for (int i = 0; i < N_JOINTS; i++) {
         if (stops->held[i])
             memset(slope[i], 0, sizeof slope[i]);

@@ -74,6 +74,12 @@ static int settable(Instance *instance, Call call, int variable)
                    VARIABLE_NAME[variable]);
 }
 
+/* True for a parameter that is an input. */
+static int is_free(int variable)
+{
+    return variable >= Q - N_FREE && variable < Q;
+}
+
 /* Set a value; dependent outputs are recomputed when they are read. A value of q or v before the run is its start
    value. */
 static void set(Instance *instance, int variable, double value)
@@ -85,12 +91,12 @@ static void set(Instance *instance, int variable, double value)
         return;
     state->plant.value[variable] = value;
     state->has_tau = state->has_rates = 0;
-    if (is_state(variable))
+    if (is_state(variable) || is_free(variable))
         state->has_x = 0;
     /* in co-simulation, each communication point finds the joints at rest */
     if (is_state(variable) || instance->kind == CO_SIMULATION || IS_CONTROLLER)
         state->has_stops = 0;
-    if (variable >= FIRST_PARAMETER)
+    if (variable >= FIRST_PARAMETER || (is_free(variable) && state->phase <= INITIALIZATION))
         state->initialised = 0;
 }
 

@@ -51,6 +51,8 @@ def add(build: Parser) -> None:
     option("--split", action="store_const", dest="part", const="split", help=text)
     text = "further outputs: mass matrix, nonlinear effects, Jacobian, or its drift"
     option("--with", dest="outputs", nargs="+", choices=("M", "h", "J", "drift"), default=[], help=text)
+    text = "make a native FMU's parameter an input, with derivatives: gravity, payload, 'friction[*]', …; repeatable"
+    build.add_repeatable("--free", metavar="P", help=text)
     flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
@@ -145,6 +147,7 @@ def _build(options: argparse.Namespace) -> Path:
         settings=parse_settings(options.settings),
         arrays=not options.scalars,
         outputs=tuple(options.outputs),
+        free=tuple(dict.fromkeys(name.removesuffix("[*]") for name in options.free)),
         platforms=tuple(dict.fromkeys(platforms)),
         **given_options(options, "axes", "link_environment", "native", "fmi", "reference", "part", "clocked"),
     )

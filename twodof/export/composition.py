@@ -13,7 +13,7 @@ from ..files import data_file
 from ..plant.plant import ParameterError, Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import read_urdf
-from ..plant.variables import CONTROLS, Starts, Value, Variable, controller_table, variable_table
+from ..plant.variables import CONTROLS, Starts, Value, Variable, controller_table, free_table, variable_table
 from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
@@ -61,6 +61,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
         table = controller_table(table)
         if options.clocked and not next(v.start for v in table if v.group == "control_period"):
             raise BuildError("the clock needs the controller's period in `settings`, as control_period = 0.005")
+    table = free_table(table, options.free) if options.free else table
     urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
     flavour = _flavour(options, robot, table, urdf, starts)
     resources = {"robot.urdf": urdf.encode(), **meshes}

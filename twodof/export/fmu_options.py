@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import BuildError, choice
-from ..plant.variables import CONTROLS, ON_REQUEST
+from ..plant.variables import CONTROLS, FREE, ON_REQUEST
 
 DEFAULT_NAME = "TwoDof"
 
@@ -28,6 +28,8 @@ class FmuOptions:
         q_start: start positions, rad or m, in the order of the joints or by name; default: the shipped arm's
             positions, or 0 if it is within the limits, or the middle of the limits.
         outputs: further outputs for controllers: "M" mass matrix, "h" nonlinear effects, "J" Jacobian, "drift" J̇ v.
+        free: parameters that are inputs of a native FMU, groups of ``FREE``: they may change during a run, and
+            the FMU has derivatives with respect to them.
         settings: start values of variables by name, as in ``experiment``.
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".
@@ -57,6 +59,7 @@ class FmuOptions:
     control: str = "task"
     settings: Mapping[str, object] = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
+    free: tuple[str, ...] = ()
     part: str = "all"
     clocked: bool = False
     name: str = ""
@@ -83,6 +86,11 @@ class FmuOptions:
         for name in self.outputs:
             if name not in ON_REQUEST:
                 raise BuildError(f"`outputs` '{name}' is unknown{choice(name, ON_REQUEST)}")
+        for name in self.free:
+            if name not in FREE:
+                raise BuildError(f"`free` '{name}' is not a parameter that can be an input{choice(name, FREE)}")
+        if self.free and (not self.native or self.part != "all"):
+            raise BuildError("`free` goes with the whole robot as a native FMU, `native=True`")
         if self.part == "controller" and self.outputs:
             raise BuildError("M, h, J and drift are outputs of the plant, which the controller alone does not have")
         if self.part == "split" and self.control == "effort":
@@ -107,6 +115,7 @@ class FmuOptions:
             "q_start",
             "control",
             "outputs",
+            "free",
             "settings",
             "part",
             "name",

@@ -33,6 +33,8 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     )
     v, a, force = _variables("v", n), _variables("a", n), _variables("force", 3)
     armature, gravity = _variables("armature", n), _variables("gravity", 3)
+    free = {name for v in table if v.causality == "input" for name in OF_PARAMETER.get(v.group, ())}
+    held = sorted({name for names in OF_PARAMETER.values() for name in names} - free)
     x, R, J, drift = task_frame(constants, joint, v)
     rows = ["xyz".index(axis) for axis in robot.axes]
     frame = _elements("task->x", x[rows])
@@ -58,9 +60,9 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     }
     texts = [c_function(f"void {head}", results) for head, results in alike.items()]
     texts += [
-        c_function(f"void {head}", results, varied(results.values(), held=HELD)) for head, results in functions.items()
+        c_function(f"void {head}", results, varied(results.values(), held=held)) for head, results in functions.items()
     ]
-    texts += _forward_dynamics(constants, bodies, joint, armature, in_all)
+    texts += _forward_dynamics(constants, bodies, joint, armature, in_all, held)
     motions = joint_motions(constants, joint, v, a, gravity)
     terms = _terms("motion", ("s", "psi", "chi"), motions)
     terms |= _terms("force", ("coriolis", "inertial", "by_q", "by_v"), joint_forces(constants, bodies, motions))
@@ -87,7 +89,7 @@ def _terms(name: str, fields: Sequence[str], values: Sequence[Array]) -> dict[st
 
 
 def _forward_dynamics(
-    robot: JointTree, bodies: Sequence[Body], joint: Array, armature: Array, in_all: str
+    robot: JointTree, bodies: Sequence[Body], joint: Array, armature: Array, in_all: str, held: Sequence[str]
 ) -> list[str]:
     """Return forward dynamics with free and with held joints.
 
@@ -112,10 +114,10 @@ def _forward_dynamics(
         f"void hybrid_dynamics({in_all}, {INERTIAS}, const double free[N_JOINTS],"
         " const double given[N_JOINTS], double a[N_JOINTS], double reaction[N_JOINTS])"
     )
-    held = c_function(hold, _elements("a", hybrid[0]) | _elements("reaction", hybrid[1]))
+    holding = c_function(hold, _elements("a", hybrid[0]) | _elements("reaction", hybrid[1]))
     return [
-        c_function(solve, _elements("a", solution), _solution(solution, inertial)),
-        f"#ifndef IS_COMPLEX\n{held}#endif\n",
+        c_function(solve, _elements("a", solution), _solution(solution, inertial, held)),
+        f"#ifndef IS_COMPLEX\n{holding}#endif\n",
     ]
 
 
@@ -127,22 +129,23 @@ MECHANISM = """\
 #include <math.h>
 """
 INERTIAS = "const EndBody *end_body, const double armature[N_JOINTS]"
-HELD = ("end_body->", "armature[", "gravity[", "payload", "offset[")
-"""Parameters, with respect to which there are no derivatives."""
+END_BODY = ("end_body->", "payload", "offset[")
+OF_PARAMETER = {"armature": ("armature[",), "gravity": ("gravity[",), "payload": END_BODY, "payload_com": END_BODY}
+"""The C variables of parameters, with respect to which there are derivatives only if they are inputs."""
 LOWER = np.tril_indices(3)
 
 
-def _solution(solution: Array, inertial: Array) -> list[Varied]:
+def _solution(solution: Array, inertial: Array, held: Sequence[str]) -> list[Varied]:
     """Return a = M⁻¹τ and its derivative δa, with M δa = δτ − δM a; ``inertial`` is M a for variables a."""
     n = len(solution)
     names = [(f"a[{i}]", f"tau[{i}]") for i in range(n)]
-    value = [a for a, _ in varied(solution, held=HELD)]
+    value = [a for a, _ in varied(solution, held=held)]
     along = {name: (a, 0.0) for (name, _), a in zip(names, value)}
     rest = {
         name: (Expression(f"cimag({name})") - force, 0.0)
-        for (_, name), (_, force) in zip(names, varied(inertial, along, HELD))
+        for (_, name), (_, force) in zip(names, varied(inertial, along, held))
     }
-    return [(a, change) for a, (change, _) in zip(value, varied(solution, rest, HELD))]
+    return [(a, change) for a, (change, _) in zip(value, varied(solution, rest, held))]
 
 
 def _places(robot: JointTree) -> dict[str, Value]:

@@ -12,23 +12,13 @@ from typing import cast
 
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
-from ..plant.variables import (
-    CONTROLS,
-    DISTURBANCES,
-    NO_RANGE,
-    RANGES,
-    Control,
-    Range,
-    Value,
-    Variable,
-    count_event_indicators,
-)
+from ..plant.variables import CONTROLS, NO_RANGE, RANGES, Range, Value, Variable, count_event_indicators
 from ..version import __version__
 from .compiler import UNITS as COMPILED
 from .flavours import Flavour
 from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
-from .native import INDICATORS
+from .model_structure import STATES, add_structure
 from .units import UNITS, add_units
 
 LOG_CATEGORIES = {
@@ -41,25 +31,13 @@ LOG_CATEGORIES = {
 VENDOR = "twodof"
 AUTHOR = "the twodof developers"
 
-UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "InitialUnknowns": "InitialUnknown"}
-"""Element names of ModelStructure in FMI 3.0, by those of FMI 2.0."""
 FMI3_TYPES = {"Real": "Float64", "Integer": "Int32"}
 """Types of FMI 3.0 whose names differ from those of FMI 2.0."""
 SCALAR = ("name", "valueReference", "description", "causality", "variability", "initial")
 """Attributes of ScalarVariable in FMI 2.0; all others belong to its type."""
-STATES = ("q", "v")
 SMALL = ("rtol", "atol", "max_step")
 """Variables whose start value is their nominal value."""
 EFFORTS = ("tau", "tau_cmd", "tau_ext")
-START = ("q_start", "q_min", "q_max")
-"""Variables on which the start value of q depends."""
-IMPACT = (*START, "v_start", "payload", "payload_com", "armature", "rigid_stops")
-"""Variables on which the start value of v depends, because a velocity into a stop is removed."""
-OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
-Dependencies = tuple[Sequence[str], str] | tuple[Sequence[str], str, Sequence[str]]
-"""A group, its elements on which a variable depends, and groups of which it depends on the same element only."""
-SENSORS = ("q_resolution", "q_noise", "v_noise", "seed", "v_from_q")
-"""Variables on which the first sample depends."""
 
 
 def model_description(
@@ -104,7 +82,7 @@ def model_description(
     _variables(root, robot, table, names, references, flavour)
     if options.clocked:
         _clock(root, table, len(reference) + 1)
-    _structure(root, robot, table, places, law, fmi)
+    add_structure(root, robot, table, places, law, fmi)
     if fmi == 3:
         annotations = ET.SubElement(root, "Annotations")
         _describe(ET.SubElement(annotations, "Annotation", type=VENDOR), robot, options.control)
@@ -265,82 +243,3 @@ def _description(elements: Sequence[dict[str, str]]) -> str:
     if len({element.get("unit") for element in elements}) > 1:
         owners = [f"{own} [{element['unit']}]" for own, element in zip(owners, elements)]
     return f"{common}: {'; '.join(owners)}"
-
-
-def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, Dependencies]]:
-    """Return the groups and elements on which each computed group depends, during a run and at its start."""
-    inputs = (*control.inputs, *DISTURBANCES)
-    law = ("gravity", *control.parameters, "limit_effort", *SENSORS, "control_delay")
-    during: dict[str, Dependencies] = {
-        "q": (("q",), OWN),
-        "v": (("v",), OWN),
-        "der_q": (("v",), OWN),
-        "x": (("q",), FRAME),
-        "quat": (("q",), FRAME),
-        "xd": (STATES, FRAME),
-        "omega": (STATES, FRAME),
-        "M": (("q",), EVERY),
-        "h": (STATES, EVERY),
-        "J": (("q",), FRAME),
-        "drift": (STATES, FRAME),
-        "tau": ((*STATES, *control.inputs), EVERY),
-        "q_meas": (("q",), OWN),
-        "v_meas": (STATES, OWN),
-        "der_v": ((*STATES, *inputs), EVERY),
-    }
-    at_the_start: dict[str, Dependencies] = {
-        "q": (START, OWN),
-        "x": (START, FRAME),
-        "quat": (START, FRAME),
-        "J": (START, FRAME),
-        "M": ((*START, "payload", "payload_com", "armature"), EVERY),
-        "h": ((*IMPACT, "gravity"), EVERY),
-        **dict.fromkeys(("v", "xd", "omega", "drift", "der_q"), (IMPACT, EVERY)),
-        "tau": ((*IMPACT, *law, *control.inputs, *STATES), EVERY),
-        "q_meas": ((*START, "q", "q_resolution", "q_noise", "seed"), OWN),
-        "v_meas": (IMPACT, EVERY, ("v", "v_noise", "seed", "v_from_q")),
-        "der_v": ((*IMPACT, "friction", "damping", *law, "control_period", *inputs), EVERY),
-    }
-    if control.commands == "effort":
-        during["tau"] = (control.inputs, OWN)
-        at_the_start["tau"] = (("limit_effort", "control_delay", *control.inputs), OWN)
-    return during, at_the_start
-
-
-def _structure(
-    root: ET.Element, robot: Robot, table: Sequence[Variable], references: Sequence[str], control: Control, fmi: int
-) -> None:
-    moves = robot.moves_frame()
-    during, at_the_start = _dependencies(control)
-
-    def known(unknown: Variable, groups: Sequence[str], whose: str, own: Sequence[str] = ()) -> dict[str, None]:
-        """Return the sorted references of the variables on which an unknown depends."""
-        return {
-            reference: None
-            for variable, reference in zip(table, references)
-            if (variable.group in (*groups, *own))
-            and ((whose != OWN and variable.group not in own) or variable.index in (unknown.index, None))
-            and (whose != FRAME or (variable.index is not None and moves[variable.index]))
-        }
-
-    computed = {reference for variable, reference in zip(table, references) if variable.causality == "output"}
-    unknowns: dict[str, dict[str, dict[str, None]]] = {part: {} for part in UNKNOWNS_3}
-    for variable, reference in zip(table, references):
-        if variable.group in during and variable.causality != "input":
-            kind = "Outputs" if variable.causality == "output" else "Derivatives"
-            for part, rule in ((kind, during), ("InitialUnknowns", at_the_start)):
-                dependencies = known(variable, *rule[variable.group])
-                if rule is at_the_start:  # where q and v are outputs, they follow from parameters
-                    dependencies = {key: None for key in dependencies if key not in computed}
-                unknowns[part].setdefault(reference, {}).update(dependencies)
-    structure = ET.SubElement(root, "ModelStructure")
-    for part, name in UNKNOWNS_3.items():
-        if not unknowns[part]:
-            continue
-        parent = ET.SubElement(structure, part) if fmi == 2 else structure
-        tag, key = ("Unknown", "index") if fmi == 2 else (name, "valueReference")
-        for reference, dependencies in unknowns[part].items():
-            ET.SubElement(parent, tag, {key: reference, "dependencies": " ".join(dependencies)})
-    indicators = (r for v, r in zip(table, references) if v.group == INDICATORS)
-    for reference in dict.fromkeys(indicators):
-        ET.SubElement(structure, "EventIndicator", valueReference=reference)

@@ -14,7 +14,8 @@ from .composition import compose, fmi_version
 from .flavours import Files
 from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
-from .model_description import FMI3_TYPES, SENSORS
+from .model_description import FMI3_TYPES
+from .model_structure import SENSORS
 
 SSP = "http://ssp-standard.org/SSP1/SystemStructure"
 SSC, SSD, SSV = (f"{{{SSP}{name}}}" for name in ("Common", "Description", "ParameterValues"))

@@ -146,6 +146,8 @@ CONTROLS = {
 ON_REQUEST = ("M", "h", "J", "drift")
 """Groups of outputs that an FMU has on request only."""
 DISTURBANCES = ("tau_ext", "f_ext")
+FREE = ("gravity", "payload", "payload_com", "friction", "damping", "armature")
+"""Groups of parameters that may be inputs, which can change during a run and have derivatives."""
 OF_THE_PLANT = {
     *DISTURBANCES,
     *("x", "xd", "quat", "omega", "q_start", "v_start", "q_min", "q_max", "rtol", "atol", "max_step"),
@@ -259,6 +261,14 @@ def variable_table(
             assert not isinstance(start, tuple)
             table.append(Variable(group, None, causality, unit, start, text))
     return table
+
+
+def free_table(table: Sequence[Variable], free: Collection[str]) -> list[Variable]:
+    """Return the table with groups of parameters as further inputs, behind the others."""
+    rest = [variable for variable in table if variable.group not in free]
+    first = next(i for i, variable in enumerate(rest) if variable.causality == "output")
+    inputs = [replace(variable, causality="input") for variable in table if variable.group in free]
+    return [*rest[:first], *inputs, *rest[first:]]
 
 
 def controller_table(table: Sequence[Variable]) -> list[Variable]:

@@ -1,0 +1,165 @@
+"""Parameters as inputs: they may change during a run, and the FMU has derivatives with respect to them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pinocchio as pin
+import pytest
+from fmpy.fmi2 import FMU2Model
+from harness import unzipped
+
+import twodof
+from twodof.errors import BuildError
+from twodof.files import data_file
+from twodof.plant.variables import FREE
+
+VALUES: dict[str, Any] = {
+    "payload": [0.3],
+    "payload_com": [0.02, -0.05, 0.01],
+    "gravity": [0.4, -9.0, 1.0],
+    "friction": [0.02, 0.01],
+    "damping": [0.05, 0.03],
+    "armature": [0.004, 0.002],
+}
+Q, V, TAU = np.array([0.4, -0.7]), np.array([1.1, -2.3]), np.array([0.3, -0.1])
+
+
+@pytest.fixture(scope="module")
+def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The bare arm, with all free parameters as inputs, and with none."""
+    folder = tmp_path_factory.mktemp("free")
+    return {
+        name: twodof.build_fmu(
+            folder / f"{name}.fmu",
+            twodof.FmuOptions(native=True, control="effort", name=name, free=free, outputs=("M",)),
+        )
+        for name, free in (("free", FREE), ("fixed", ()))
+    }
+
+
+def inverse_dynamics(values: dict[str, Any], a: np.ndarray) -> np.ndarray:
+    """Return M a + h with friction, by Pinocchio."""
+    model = pin.buildModelFromUrdf(str(data_file("urdf", "2dof.urdf")))
+    frame = model.frames[model.getFrameId("EndEffector")]
+    point = pin.Inertia(values["payload"][0], np.array(values["payload_com"]), np.zeros((3, 3)))
+    model.appendBodyToJoint(frame.parentJoint, point, frame.placement)
+    model.gravity.linear = np.array(values["gravity"])
+    of_joints = np.sign(V) * values["friction"] + V * values["damping"] + a * values["armature"]
+    return np.array(pin.rnea(model, model.createData(), Q, V, a)) + of_joints
+
+
+class FMU2Arm(FMU2Model):
+    """The bare arm in initialization mode, as Model Exchange."""
+
+    def open(self, fmu: Path, **values: Any) -> Any:
+        description = fmpy.read_model_description(str(fmu))
+        self.vr = {v.name: v.valueReference for v in description.modelVariables}
+        super().__init__(
+            guid=description.guid, modelIdentifier=fmu.stem, instanceName="arm", unzipDirectory=unzipped(fmu)
+        )
+        self.instantiate()
+        self.put(**values)
+        self.setupExperiment(startTime=0.0)
+        self.enterInitializationMode()
+        return self
+
+    def elements(self, *groups: str) -> list[int]:
+        return [vr for name, vr in self.vr.items() for group in groups if name.partition("[")[0] == group]
+
+    def put(self, **values: Any) -> None:
+        for group, value in values.items():
+            self.setReal(self.elements(group), list(value))
+
+
+def test_derivatives_are_those_of_pinocchio(fmus: dict[str, Path]) -> None:
+    """M ∂q̈ = −∂(M a + h) at a = q̈. Central differences are exact: M a + h is of second order in each value."""
+    arm = FMU2Arm.__new__(FMU2Arm).open(fmus["free"], **VALUES, q_start=Q, v_start=V, tau_cmd=TAU)
+    arm.exitInitializationMode()
+    rates = [arm.vr["der(v[1])"], arm.vr["der(v[2])"]]
+    a = np.array(arm.getReal(rates))
+    np.testing.assert_allclose(inverse_dynamics(VALUES, a), TAU, atol=1e-12)
+    zero = inverse_dynamics(VALUES, np.zeros(2))
+    M = np.column_stack([inverse_dynamics(VALUES, unit) - zero for unit in np.eye(2)])
+    for group in VALUES:
+        for i, vr in enumerate(arm.elements(group)):
+            change = np.array([inverse_dynamics({**VALUES, group: row}, a) for row in changed(group, i)])
+            expected = -np.linalg.solve(M, (change[1] - change[0]) / 0.5)
+            for _ in range(2):  # the first derivative at a point is computed alone, others together
+                found = arm.getDirectionalDerivative(rates, [vr], [1.0])
+                np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-11, err_msg=f"{group}, {i}")
+
+
+def test_what_depends_on_a_free_parameter_follows_it(fmus: dict[str, Path]) -> None:
+    """The mass matrix, and in initialization mode the impact on a stop."""
+    at_the_limit = {"q_start": [np.pi, 0.3], "v_start": [1.0, 0.5], "q_max": [np.pi, np.pi]}
+    values = []
+    for first, then in ((0.0, 0.3), (0.3, 0.3)):
+        arm = FMU2Arm.__new__(FMU2Arm).open(fmus["free"], **at_the_limit, payload=[first])
+        before = arm.getReal(arm.elements("M", "v"))
+        arm.put(payload=[then])
+        values.append((before, arm.getReal(arm.elements("M", "v"))))
+    arm.exitInitializationMode()
+    assert arm.getReal(arm.elements("M")) == values[1][0][-4:]
+    arm.put(payload=[0.0])
+    assert arm.getReal(arm.elements("M")) == values[0][0][-4:]
+    assert values[0][1] == values[1][1]
+    assert all(a != b for a, b in zip(values[0][0][-3:], values[0][1][-3:]) if b != 0.0)
+
+
+@pytest.mark.parametrize(
+    "control, unknown, knowns",
+    [("effort", "der(v[1])", VALUES), ("task", "tau[1]", {*VALUES} - {"friction", "damping"})],
+)
+def test_the_description_tells_what_depends_on_them(
+    fmus: dict[str, Path], tmp_path: Path, control: str, unknown: str, knowns: Any
+) -> None:
+    fmu = fmus["free"]
+    if control != "effort":
+        fmu = twodof.build_fmu(tmp_path / "a.fmu", twodof.FmuOptions(native=True, control=control, free=FREE))
+    description = fmpy.read_model_description(str(fmu))
+    unknowns = {each.variable.name: each for each in (*description.outputs, *description.derivatives)}
+    names = {each.name.partition("[")[0] for each in unknowns[unknown].dependencies}
+    assert names & {*VALUES} == {*knowns}
+
+
+def changed(group: str, i: int) -> list[np.ndarray]:
+    """Return a group's values with one of them 0.25 less and 0.25 more."""
+    return [VALUES[group] + change * np.eye(len(VALUES[group]))[i] for change in (-0.25, 0.25)]
+
+
+def test_a_payload_that_is_dropped_is_a_run_after_a_run(fmus: dict[str, Path]) -> None:
+    fine = {"rtol": 1e-11, "atol": 1e-13, "tau_cmd": (0.4, 0.1)}
+    changes = [(0.0, {"payload": 0.3}), (0.2, {"payload": 0.0})]
+    whole = [s.q for s in twodof.samples(fmus["free"], step=0.01, stop_time=0.5, settings=fine, changes=changes)]
+    first = list(twodof.samples(fmus["fixed"], step=0.01, stop_time=0.2, settings={**fine, "payload": 0.3}))
+    start = {"q_start": tuple(first[-1].q), "v_start": tuple(first[-1].v)}
+    rest = list(twodof.samples(fmus["fixed"], step=0.01, stop_time=0.3, settings={**fine, **start}))
+    np.testing.assert_allclose(whole[:21], [s.q for s in first], atol=1e-9)
+    np.testing.assert_allclose(whole[20:], [s.q for s in rest], atol=1e-9)
+    assert np.abs(whole[-1] - np.array([s.q for s in first][-1])).max() > 0.1
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("control", ["task", "joint", "pose"])
+def test_an_fmu_with_free_parameters_passes_the_checks(tmp_path: Path, control: str, fmi: int) -> None:
+    """These compare all derivatives with central differences."""
+    options = twodof.FmuOptions(native=True, control=control, fmi=fmi, free=FREE, outputs=("M", "h"))
+    report = twodof.check(twodof.build_fmu(tmp_path / "free.fmu", options))
+    assert report.passed, report
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"free": ("paylod",), "native": True}, "`free` 'paylod' is not a parameter that can be an input.*payload"),
+        ({"free": ("payload",)}, "`native=True`"),
+        ({"free": ("payload",), "native": True, "part": "controller"}, "the whole robot"),
+    ],
+)
+def test_what_cannot_be_free_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(BuildError, match=message):
+        twodof.FmuOptions(**given)
