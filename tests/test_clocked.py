@@ -260,9 +260,9 @@ def test_states_of_instances_with_and_without_a_clock_are_apart(events: Any, law
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"fmi": 3}, "samples the controller alone, in FMI 3"),
-        ({"part": "controller"}, "samples the controller alone, in FMI 3"),
-        ({"part": "controller", "fmi": 3}, "the clock needs the controller's period"),
+        ({"fmi": 3}, "`clocked` goes with `part` controller and `fmi` 3"),
+        ({"part": "controller"}, "`clocked` goes with `part` controller and `fmi` 3"),
+        ({"part": "controller", "fmi": 3}, "the clock needs the controller's period; set control_period"),
     ],
 )
 def test_what_cannot_have_a_clock_is_not_built(tmp_path: Path, given: dict[str, Any], message: str) -> None:

@@ -60,7 +60,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     if options.part == "controller":
         table = controller_table(table)
         if options.clocked and not next(v.start for v in table if v.group == "control_period"):
-            raise BuildError("the clock needs the controller's period in `settings`, as control_period = 0.005")
+            raise BuildError("the clock needs the controller's period; set control_period, to 0.005 s for example")
     table = free_table(table, options.free) if options.free else table
     urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
     flavour = _flavour(options, robot, table, urdf, starts)

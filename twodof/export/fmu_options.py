@@ -101,7 +101,7 @@ class FmuOptions:
             raise BuildError("the controller alone is native, `native=True`, and has a control law other than 'effort'")
 
         if self.clocked and (self.part != "controller" or self.fmi != 3):
-            raise BuildError("a clock samples the controller alone, in FMI 3: `part='controller'`, `fmi=3`")
+            raise BuildError("`clocked` goes with `part` controller and `fmi` 3")
 
     @property
     def is_default_arm(self) -> bool:
