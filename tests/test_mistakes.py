@@ -4,11 +4,15 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import twodof
 from twodof.cli.main import main
+from twodof.cli.printing import plain
+from twodof.export.start_values import no_variable
+from twodof.plant.variables import Variable
 
 RUN = "run arm.fmu -o out --stop-time 0.02"
 MISTAKES: dict[str, str] = {
@@ -238,3 +242,18 @@ def test_a_mistake_in_python_gets_its_remedy(mistake, things, monkeypatch):
     call, words = CALLS[mistake]
     with pytest.raises((twodof.TwoDofError, TypeError, AttributeError), match=words):
         call()
+
+
+@pytest.mark.parametrize(
+    "name, meant",
+    [("controler.Kp", "Kp"), ("controller.Kpp", "Kp"), ("controller.control_perod", "controller.control_period")],
+)
+def test_a_name_of_a_system_that_is_mistyped_suggests_the_nearest(name: str, meant: str) -> None:
+    names = ("Kp", "Kd", "controller.seed", "controller.control_period", "plant.payload")
+    variables = {each: Variable(each, None, "input", "", 0.0, "") for each in names}
+    system = SimpleNamespace(variables=variables, control="", joints=())
+    assert no_variable(system, name, "input").endswith(f"did you mean '{meant}'?")
+
+
+def test_a_tab_in_a_name_is_printed_as_an_escape() -> None:
+    assert plain("joint\t1\n") == "joint\\t1\n"

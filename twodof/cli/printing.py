@@ -45,7 +45,7 @@ def plain(text: str) -> str:
 
     Names in untrusted files can then neither control the terminal nor reverse a line.
     """
-    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 def quote(path: Path) -> str:

@@ -6,7 +6,7 @@ from itertools import chain, count, takewhile
 from math import inf, isfinite
 from typing import Protocol
 
-from ..errors import InputError, choice
+from ..errors import InputError, choice, nearest
 from ..plant.variables import CONTROLS, Value
 
 Setting = object
@@ -130,6 +130,9 @@ def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
     groups = {g: names for causality in causalities for g, names in groups_of(fmu.variables, causality).items()}
     indexed = re.sub(r"_?(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
     known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
-    own = [each for each in (indexed, name.rpartition(".")[2]) if each in known]  # Kp of a system, not controller.Kp
+    near = nearest(name, known, 0.85)
+    if near is None and "." in name:  # Kp of a system, not controller.Kp
+        near = nearest(name.rpartition(".")[2], [each for each in known if "." not in each], 0.6)
+    own = [each for each in (indexed, near) if each in known]
     like = f"; did you mean '{own[0]}'?" if own else choice(name, known, cutoff=0.4)
     return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"
