@@ -7,6 +7,7 @@ import os
 import re
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -79,6 +80,18 @@ def test_notebooks_show_it(default):
     figure = plot(twodof.read_bag(default.bag))
     assert isinstance(figure, Figure) and isinstance(figure, Plot)
     assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("kind", ["png", "html"])
+def test_numbers_too_large_for_an_axis_are_gaps(default, tmp_path, kind):
+    q = np.linspace([0.0, 0.0], [1.0, 2.0], 100)
+    q[40:42, 0] = 1.7e308, -1.7e308
+    run = replace(long_run(default, q), provenance={})
+    line = only(panels(plot(run)).q[0], "Kp50")
+    assert np.isnan(line[40:42, 1]).all() and np.array_equal(
+        np.delete(line[:, 1], [40, 41]), np.delete(q[:, 0], [40, 41])
+    )
+    assert save(drawing(read_tracks([run])), tmp_path / f"large.{kind}").stat().st_size
 
 
 # --- long bags ---

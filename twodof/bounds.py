@@ -56,7 +56,7 @@ MAX_SUMMARY = 64 * MIB
 MAX_METADATA = 64 * MIB
 MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much memory
 MAX_HELD = 5_000_000  # input values, summed over all changes of inputs
-MAX_VALUE = 1e100  # of a sample that is judged or fitted: squares of much larger numbers overflow
+MAX_VALUE = 1e100  # of a sample that is judged, fitted or drawn: squares of much larger numbers overflow
 MAX_PROFILES = 64 * KIB  # different QoS profiles of all topics, in YAML, which is slow to parse
 MAX_DEFINITION = 64 * KIB  # a message type
 

@@ -1,7 +1,7 @@
 """Derived quantities of a bag and its robot: limits, path, target and error of the end effector."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_downsampled
 from ..bag.recording import Recording, Verdict
+from ..bounds import MAX_VALUE
 from ..errors import BuildError, PlotError
 from ..export.closed_form import Array, Held, task_error
 from ..export.urdf_source import read_text
@@ -186,21 +187,27 @@ def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> 
 
 def _with_robot(bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None) -> Track:
     run, settings = bag.provenance, settings_of(bag)
+    drawn = replace(bag, q=_drawable(bag.q), v=_drawable(bag.v), tau=_drawable(bag.tau))
     if urdf is None:
-        return Track(bag, settings, bag.t, _joints(bag, names, None), None, None)
+        return Track(bag, settings, bag.t, _joints(drawn, names, None), None, None)
     try:
         at = run.get("frame", "") if frame is None else frame
         linkage = load_linkage(urdf, at, run.get("axes") or "xyz", names)
     except RobotError as error:
         raise PlotError(f"{source}: {error}") from error
-    joints, q = _joints(bag, names, linkage), _of_linkage(bag, linkage, names, bag.q)
+    joints, q = _joints(drawn, names, linkage), _of_linkage(bag, linkage, names, drawn.q)
     motion, task = linkage.motion(q), None
     rooted = run or (bag.received is not None and bag.received.frame == linkage.urdf.root)
     known = bag.target.size and not np.isnan(bag.target[-1]).any()
     if rooted and known and run.get("frame", linkage.frame) == linkage.frame:
-        v = _of_linkage(bag, linkage, names, bag.v)
+        v = _of_linkage(bag, linkage, names, drawn.v)
         task = _task(bag, linkage, joints, q, v[0], motion.path)
     return Track(bag, settings, bag.t, joints, motion, task, linkage)
+
+
+def _drawable(values: Array) -> Array:
+    """Return values with NaN, a gap, in place of numbers too large for the arithmetic of axes."""
+    return np.where(np.isfinite(values) & (np.abs(values) > MAX_VALUE), np.nan, values)
 
 
 def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tuple[JointTrack, ...]:
