@@ -21,7 +21,7 @@ Fit a robot to its bags:        fit, Fit; excite, Excitation for a motion to rec
 Linear models:                  linearise, LinearModel
 ROS 2 and Foxglove:             publish, publish_together, Publisher, Foxglove, layouts
 
-Errors that a user can correct are a TwoDofError. Without its extra, a function or class raises one that names it.
+Errors that a user can correct are subclasses of TwoDofError. The error of a missing extra names it.
 """
 
 from typing import NoReturn

@@ -198,7 +198,7 @@ def descriptor_of(path: str | Path) -> int | None:
 def target_of(path: str | Path) -> Path:
     """Return the path of an output, through links as far as Linux's rule fs.protected_symlinks follows them.
 
-    In a sticky folder for all users, such as /tmp, another user's link could name any file of this user: refused.
+    In a sticky folder for all users, such as /tmp, links of other users are refused: they could name any file.
     """
     for name in _names(path):
         folder, owner = name.parent.stat(), name.lstat().st_uid if name.is_symlink() else os.geteuid()
@@ -208,7 +208,7 @@ def target_of(path: str | Path) -> Path:
 
 
 def _names(path: str | Path) -> Iterator[Path]:
-    """Yield a path, and what it names as a link, each with the real path of its folder."""
+    """Yield a path and the targets of its links in turn, each with the real path of its folder."""
     for _ in range(MAX_LINKS_FOLLOWED):
         yield (path := Path(os.path.realpath(Path(path).parent), Path(path).name))
         if not path.is_symlink():

@@ -112,7 +112,7 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
 
 
 def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
-    """Return periodic records as rows, one for each repetition of the records between the first offset and the end.
+    """Return periodic records as rows; a period consists of the records from the first offset to the end.
 
     If a channel occurs twice in a period, return the first row only, so that the channel's messages stay in order.
     """

@@ -15,7 +15,7 @@ REPLACED = ".replaced"
 class OldBag:
     """The bag that a new one replaces, if any; it keeps the suffix .replaced until the new one has samples.
 
-    Whenever the process is killed, one of them is whole, or as far as it was written.
+    A process that is killed at any time leaves the old bag, or the new one as far as it was written.
 
     Args:
         path: folder of both.

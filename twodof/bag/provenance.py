@@ -79,7 +79,7 @@ class Provenance(TypedDict, total=False):
 class ProvenanceFile:
     """run.json of a bag in progress, a valid file with all changes so far at any moment.
 
-    The changes of inputs stand at its end, before the commanders only, so that adding one rewrites few bytes.
+    Only the commanders and the verdict follow the changes of inputs, so that adding a change rewrites few bytes.
 
     Args:
         folder: folder of the bag.

@@ -136,7 +136,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Write help, or raise: argparse ignores that it cannot be written, where output is not buffered."""
+        """Write help; raise an error of the write, which argparse ignores if output is unbuffered."""
         if file is sys.stdout is not None:
             sys.stdout.write(message)
         else:

@@ -52,8 +52,8 @@ def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: A
 def joint_forces(robot: JointTree, body: Sequence[Body], motions: Sequence[Array]) -> list[Array]:
     """Return for each joint Bᵀs (N × 3: its linear part is 0), I s, and the two wrenches in brackets above (N × 6).
 
-    Those of joints at the root, which no other joint is before, are 0. Of a body with the momentum p, and the first
-    moment d and the inertia J about the origin, B maps an angular velocity w to the moment and the force
+    The wrenches of joints at the root are 0. For a body with the momentum p, the first moment d and the inertia J about
+    the origin, B maps an angular velocity w to the moment and the force
 
         ω × (J − tr J/2) w − d × (v × w),   w × p
     """

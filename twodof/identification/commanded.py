@@ -26,7 +26,7 @@ def commanded_efforts(recording: Recording) -> Array:
     those before and after it, because the positions around this sample are due to both.
 
     Raises:
-        InputError: the bag does not say what its controller did.
+        InputError: the bag does not determine the efforts.
         BagError: the run.json does not fit the samples.
     """
     run, name = recording.provenance, recording.path

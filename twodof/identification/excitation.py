@@ -57,7 +57,7 @@ class Excitation(NamedTuple):
         joints: names of the robot's n joints.
         t: time, s, N.
         q, v, a: positions, rad or m, and their derivatives, N × n.
-        factor: how many times narrower the intervals are, the geometric mean over all directions of the parameters.
+        factor: median width of intervals with random motions, relative to this motion; geometric mean over directions.
     """
 
     joints: tuple[str, ...]
@@ -82,7 +82,7 @@ class Excitation(NamedTuple):
 
 
 class _Design:
-    """Motions of a robot within its limits, and what a fit can tell from them.
+    """Motions of a robot within its limits, and the covariance of a fit to them.
 
     Attributes:
         shape: shape of the coefficients a and b: n × 2 × harmonics.

@@ -52,9 +52,9 @@ class Model(NamedTuple):
     text: str
     urdf: Urdf
     locked: Urdf
-    """The same with fixed joints."""
+    """``urdf`` with its locked joints fixed."""
     robot: Robot
-    """Dynamics of the latter."""
+    """Dynamics of ``locked``."""
     patterns: Sequence[str]
 
     def parameters(self, gravity: Sequence[float]) -> Parameters:

@@ -140,7 +140,7 @@ def _thinned(whole: Sequence[Stretch], most: int, purpose: str) -> list[Stretch]
 def jumps(recordings: Sequence[Recording], robot: Robot) -> dict[str, float]:
     """Return the time, s, of the largest jump of the effort of each joint whose effort jumps between samples.
 
-    What the effort was between two samples is not recorded. The fit takes it as smooth, which is wrong at a jump.
+    The fit takes the effort between two samples as smooth, which is wrong at a jump.
     """
     from scipy.stats import kurtosis
 

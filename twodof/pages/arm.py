@@ -46,7 +46,7 @@ CONTAINER = b'<div class="arm" id="arm"'
 
 
 def names_page(path: Path) -> bool:
-    """Return whether a path may name a page: its suffix is that of a page, and it is more than a suffix."""
+    """Return whether a path has the suffix of a page after a name."""
     return path.suffix.lower() in PAGES and (bool(path.suffix) or not path.name.startswith("."))
 
 

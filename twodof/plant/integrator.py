@@ -1,4 +1,4 @@
-"""Dormand–Prince 5(4) over one communication step, with located joint-limit stops.
+"""Integrate one communication step by Dormand–Prince 5(4) or ROS34PW2, with located events.
 
 The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every
 communication step restarts with the step min(max_step, h), so that the integrator has no state between them.
@@ -287,7 +287,7 @@ def advance(
 
     Raises:
         FloatingPointError: the equations gave a value that is not finite.
-            StepError: the state changes too fast.
+        StepError: the state changes too fast.
     """
     n, budget, motion = len(q), budget or Budget(), _Motion(equations, stops, rtol, atol, max_step, integrator)
     motion.evaluations = budget.spent

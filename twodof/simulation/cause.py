@@ -8,7 +8,7 @@ from .setup import Array
 
 KINDS = {
     "diverged": "a value that is not finite",
-    "degrees": "a value in degrees where radians are meant",
+    "degrees": "a value in degrees instead of radians",
     "reach": "the target is out of reach",
     "gain": "a gain of 0",
     "feedforward": "a target that rests, with a target velocity or acceleration",
@@ -37,7 +37,7 @@ class Cause(NamedTuple):
         joint: joint concerned, or "".
         time: time at which it was first seen, s since the first sample; None if it holds for the whole run.
         point: nearest reachable position in the root frame, m; () for other kinds.
-        noted: whether it is only a consequence: of another cause, or of the motion.
+        noted: whether it is a consequence of another cause or of the motion.
     """
 
     kind: str
