@@ -1,4 +1,4 @@
-"""Robots that are measured, and their engines compiled with a program in C around them."""
+"""Measured robots, and their engines compiled with a C program."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Sources = dict[str, bytes]
 
 @dataclass(frozen=True)
 class Arm:
-    """A robot, the start values of its run by group of variables, and its control."""
+    """A robot, the start values of its run by group, and its control."""
 
     robot: Robot
     starts: dict[str, Any]
@@ -71,7 +71,7 @@ def ur5(control: str = "task") -> Arm:
 
 
 def chain(n: int) -> Arm:
-    """Return a chain of rods whose joints rotate about y and z in turns."""
+    """Return a chain of rods whose joints rotate alternately about y and z."""
     links = [
         f'<link name="l{i}"><inertial><origin xyz="0.05 0 0"/><mass value="0.5"/>'
         '<inertia ixx="1e-4" iyy="5e-4" izz="5e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'

@@ -1,11 +1,10 @@
-"""Cost of a run besides the native engine: logging, scenes, sweeps, start-up, big bags.
+"""Cost of a run in addition to the native engine: logging, scenes, sweeps, start-up, large bags.
 
     python benchmarks/around.py [MESSAGES]
 
-Processor time. What is compared takes turns, so that noise of the machine hits all alike; ratios
-are medians over the turns. Processes are measured whole, with their children, and with bytecode at
-hand, as pip leaves it. MESSAGES is the size of the big bag, ten million if it is not given, which
-takes some 1.3 GB of disk for a while.
+Times are processor times. The compared programs run in turns, so that the machine's noise affects all of them; ratios
+are medians over the turns. Processes are measured with their children and with compiled bytecode, as pip installs it.
+MESSAGES is the size of the large bag (default: ten million messages, about 1.3 GB of disk during the run).
 """
 
 from __future__ import annotations
@@ -52,9 +51,9 @@ sys.exit(code)
 
 
 def process(*arguments: str, folder: Path) -> tuple[float, float]:
-    """Measure the processor time, s, and peak memory, MB, of a command and its children.
+    """Measure the processor time, s, and the peak memory, MB, of a command and its children.
 
-    Started by a small process: at first a child counts the memory of the one that it comes from.
+    A small process starts the command, because the memory of a child initially includes that of its parent.
     """
     command = [sys.executable, "-S", "-c", MEASURE, *TWODOF, *arguments]
     caching = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}
@@ -64,7 +63,7 @@ def process(*arguments: str, folder: Path) -> tuple[float, float]:
 
 
 def big_bag(fmu: twodof.Fmu, path: Path, messages: int) -> None:
-    """Write the first ten seconds repeatedly, which takes less time than to simulate all."""
+    """Write the first ten seconds repeatedly, which is faster than simulating all."""
     run = twodof.experiment(fmu, stop_time=messages * STEP, step=STEP, stamp_start=1_700_000_000)
     with twodof.Bag(path).begin(run) as bag:
         source = twodof.samples(run)
@@ -103,7 +102,7 @@ def steps_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float], folder: Pa
 
 
 def verdict_around(fmu: twodof.Fmu) -> Iterator[Figure]:
-    """Compare the verdict of a block of samples with the run of the block; the least of many turns of each."""
+    """Compare the verdict of a block of samples with the run of the block; the least of many turns each."""
     run = twodof.experiment(fmu, stop_time=(1 + BLOCKS) * BLOCK * STEP, step=STEP)
     judge, steps = judge_of(run, None), twodof.samples(run)
     row = memoryview(bytes(8 * sum(len(fmu.vector(group)) for group in OUTPUTS)))
@@ -149,7 +148,7 @@ def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterato
 def workers_around(fmu: twodof.Fmu) -> Iterator[Figure]:
     """Compare two workers with one.
 
-    A start is a sweep of one run for each worker; a run is the cost of one more.
+    A start is a sweep of one run for each worker; a run is the cost of one more run.
     """
     gains = np.linspace(10.0, 200.0, SWEPT)
 

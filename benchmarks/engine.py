@@ -1,21 +1,20 @@
-"""The native engine in C by robot, path and compiler, compared with MuJoCo and C of CasADi.
+"""The native engine in C by robot, path and compiler, compared with MuJoCo and with C by CasADi.
 
     python benchmarks/engine.py [JOINTS ...]
 
-Processor time, without Python. Steps are of 10 ms: of the default arm, a Panda and chains with so
-many joints (2, 7, 16 and 30 if none are given; thirty take minutes to compile). In each round all
-programs run once, so that noise of the machine hits all alike; ratios are medians over the rounds.
+Times are processor times without Python, for steps of 10 ms of the default arm, a Panda, and chains of JOINTS joints
+(default: 2, 7, 16 and 30; 30 take minutes to compile). Each round runs all programs once, so that the machine's noise
+affects all of them; ratios are medians over the rounds.
 
-- The engine: Dormand-Prince 5(4), rtol 1e-3, atol 1e-6, steps of 1 ms at most; with controller and
-  limits, none of which is reached; compiled as in its FMU. Where nothing but an unlimited control
-  torque acts, M⁻¹ M need not be computed: M cancels; elsewhere it takes the general path.
-- CasADi's code (generated.py) runs in the same integrator, at the best of its builds; it does
-  without ranks and payloads.
-- MuJoCo (mujoco_step.c): mj_step, RK4, steps of 1 ms; limits off, no shapes and so no contacts;
-  free and with the guide's controller in each stage. Its library is that of its package, which is
-  not imported: that has the library ask for the time, at more than the cost of a step.
-- A derivative is one along a direction of all states, in Model Exchange; the least of many calls. A Jacobian is that of
-  the accelerations by all states and joint efforts, asked for a column at a time at points that are new.
+- Engine: Dormand-Prince 5(4), rtol 1e-3, atol 1e-6, largest step 1 ms, with controller and limits, which are not
+  reached, compiled as in its FMU. If only an unlimited control torque acts, M cancels; otherwise the engine uses the
+  general path.
+- CasADi's code (generated.py) runs in the same integrator, in its fastest build, without ranks and payloads.
+- MuJoCo (mujoco_step.c): mj_step, RK4, steps of 1 ms, without limits, shapes and contacts; free, and with the
+  tutorial's controller in each stage. The library is that of its Python package, which is not imported, because it
+  makes the library read the clock, at more than the cost of a step.
+- A derivative has a direction of all states, in Model Exchange; the least of many calls. A Jacobian has the derivatives
+  of the accelerations with respect to all states and joint efforts, a column at a time, at new points.
 """
 
 from __future__ import annotations
@@ -85,9 +84,9 @@ def programs(n: int, folder: Path) -> dict[str, Callable[[], float]]:
 
 
 def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]]]:
-    """Compile mujoco_step.c; return a function that runs some steps: a step's cost, s, and the last angles.
+    """Compile mujoco_step.c; return a function that runs some steps, and returns a step's cost, s, and the last angles.
 
-    A run has a process of its own, in which MuJoCo's Python package is not even imported.
+    Each run has its own process, which does not import MuJoCo's Python package.
     """
     (package,) = importlib.util.find_spec("mujoco").submodule_search_locations
     (library,) = Path(package).glob("libmujoco.*")
@@ -106,7 +105,7 @@ def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]
 
 
 def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float, float, float]:
-    """Measure the right-hand side, a derivative, and the Jacobian by states and efforts, s: the least of runs."""
+    """Measure the right-hand side, a derivative, and the Jacobian by states and efforts, s; the least of the runs."""
     side_cost = compiled(arm, folder, "native_step.c").side_cost
     side_cost.restype = ctypes.c_double
     names = [variable.name for variable in variable_table(arm.robot, arm.starts, arm.control)]
@@ -136,7 +135,7 @@ def best(path: str, rounds: list[Costs]) -> str:
 
 
 def growth(joints: Sequence[int], times: Sequence[float]) -> float:
-    """Return the exponent p of time ~ joints^p, the largest between neighbours."""
+    """Return the largest exponent p of time ~ joints^p between neighbouring sizes."""
     pairs = itertools.pairwise(zip(joints, times, strict=True))
     return max(math.log(t1 / t0) / math.log(n1 / n0) for (n0, t0), (n1, t1) in pairs)
 

@@ -1,9 +1,9 @@
-"""Measure fits: how often the 95 % intervals contain the true values.
+"""Measure how often the 95 % intervals of fits contain the true values.
 
-    python benchmarks/fit.py [SEEDS]         the default arm, 60 s, by seeds of the noise (200), about 3 minutes
+    python benchmarks/fit.py [SEEDS]         the default arm, 60 s; SEEDS seeds of the noise (200), about 3 minutes
 
-Recordings are MuJoCo's, in steps of 0.1 ms, with friction, damping, armature and a payload that the URDF does not
-have; positions have noise of 1e-4 rad, and efforts of 2 %. The motion is recorded once, its noise drawn by each seed.
+MuJoCo makes the recordings, in steps of 0.1 ms, with friction, damping, armature and a payload that the URDF does not
+have. Positions have noise of 1e-4 rad, efforts of 2 %. The motion is recorded once; each seed draws its noise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from test_fit import ARM, FREE, GRAVITY, HIDDEN, JOINTS, TRUTH
 
 
 def main(seeds: int) -> None:
-    """Print how often the intervals hold the truth."""
+    """Print how often the intervals contain the true values."""
     model = mujoco_model(ARM.read_text("utf-8"), payload=TRUTH["payload"], end="EndEffector", **HIDDEN)
     motion = move(model, [-0.5, 0.6], 0.8, 60.0, fastest=2.0)
     truth, errors, flagged, begin = np.array([*TRUTH.values()]), [], 0, time.process_time()

@@ -1,8 +1,7 @@
 """The native engine with a right-hand side in C that CasADi generates, for comparison.
 
-q̈(q, v) of the task control is one function of CasADi's, from the textbook's recursions with the
-robot's constants folded, in the integrator of the native engine. It does less: it knows no payload,
-no force and no rank. J⁺ is Jᵀ (J Jᵀ)⁻¹, which fails where J loses rank.
+q̈(q, v) under task control is one CasADi function, made by the textbook's recursions with the robot's constants folded,
+in the native engine's integrator. It has no payload, force or rank. J⁺ is Jᵀ (J Jᵀ)⁻¹, which fails where J loses rank.
 """
 
 from __future__ import annotations
@@ -75,8 +74,8 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
     """Return q̈ as a function of q, v and INPUTS.
 
     Args:
-        robot: without joints that mimic others.
-        way: to what damping and tau_ext cause, a key of WAYS; None: they are 0.
+        robot: a robot without mimic joints.
+        way: the method for the effects of damping and tau_ext, a key of WAYS; None: they are 0.
     """
     constants, n, axes = joint_tree(robot), len(robot.joints), len(robot.axes)
     sizes = {"q": n, "v": n, **dict.fromkeys(INPUTS, axes), "Kn": 1, "tau_ext": n}

@@ -1,12 +1,12 @@
-"""Measure the error and the cost of `max_step` on chosen robots: the reason for its default of 1 ms.
+"""Measure error and cost of `max_step` on chosen robots: the reason for its default of 1 ms.
 
     python benchmarks/largest_step.py [ROBOT …]      about a minute for panda, ur5_robot and kinova
 
-Each robot starts at home at up to 1 rad/s a joint, under each control, and is sampled at 10 ms for
-2 s. Task control follows a target up to 0.1 m from home an axis, joint control one up to 0.5 rad
-from home a joint, and the bare plant falls. "error" is the largest difference of a joint, rad or m,
-at the default tolerances, from the same motion at rtol 1e-11 and atol 1e-13; "time" is the
-processor time of the whole run, without a bag, relative to that with 1 ms, where runs take turns.
+Each robot starts at its home pose with up to 1 rad/s in each joint, under each control, and is sampled every 10 ms for
+2 s. Targets are up to 0.1 m from home along each axis under task control, and up to 0.5 rad in each joint under joint
+control; the bare plant falls. "error" is the largest difference of a joint, rad or m, at the default tolerances, from
+the same motion at rtol 1e-11 and atol 1e-13. "time" is the processor time of the run without a bag, relative to that
+with 1 ms; runs take turns.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def run(fmu: Path, settings: Mapping[str, float]) -> tuple[np.ndarray, float]:
 
 
 def measure(fmu: Path, control: str) -> list[str]:
-    """Return the largest error and the median time relative to that of the first cap, for each cap."""
+    """Return, for each cap, the largest error and the median time relative to that of the first cap."""
     errors, times = np.empty((MOTIONS, len(CAPS))), np.empty((MOTIONS, len(CAPS)))
     for i, settings in enumerate(motions(fmu, control)):
         exact, _ = run(fmu, settings | EXACT)

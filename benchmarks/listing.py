@@ -1,10 +1,9 @@
-"""The tutorial's program as it is written, without its ROS 2 node. Do not use it: it is wrong.
+"""The tutorial's program as written, without its ROS 2 node. Do not use it: it is wrong.
 
-It is here so that the benchmark can measure it. Its two mistakes are kept, and marked: the
-Jacobian is taken in the frame of the end effector although the error is in that of the world,
-and the Jacobian's time variation is read although nothing computes it. Its solver call, its
-``pinv``, its order of calls and its clock that adds up steps are the guide's too. The equations
-that it means to solve are those of ``twodof.plant``.
+The benchmark measures it. Its two mistakes are kept and marked: the Jacobian is in the frame of the end effector
+although the error is in the world frame, and the Jacobian's time variation is read although nothing computes it. Its
+solver call, its ``pinv``, its order of calls and its clock that accumulates steps are the tutorial's too. The equations
+that it intends are those of ``twodof.plant``.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from scipy.integrate import solve_ivp
 
 
 class PendulumSimulator:
-    """The guide's node: ``step`` is its timer's callback, ``q`` and ``v`` what it publishes."""
+    """The tutorial's node: ``step`` is its timer's callback; it publishes ``q`` and ``v``."""
 
     def __init__(self, urdf_path: str | Path) -> None:
         self.model = pin.buildModelFromUrdf(str(urdf_path))

@@ -1,6 +1,5 @@
-/* Cost of one communication step that is logged, in C, the engine compiled in: what a run with its
-   bag cannot be faster than. doStep, getReal of q, v, x and tau, a JointState as it is serialised
-   behind the head of an MCAP record, and fwrite. */
+/* Cost of one logged communication step in C, with the engine compiled in: the lower bound of a run with its bag.
+   It consists of doStep, getReal of q, v, x and tau, a serialised JointState in an MCAP record, and fwrite. */
 #include <stdio.h>
 #include <string.h>
 #include <time.h>
@@ -9,7 +8,7 @@
 
 enum { HEAD = 31, BEFORE = 60, SIZE = BEFORE + 16 * N_JOINTS };
 
-/* Processor time of a step, s, the mean of a run from the start; NaN where a call fails. */
+/* Processor time of a step, s, the mean of a run from the start; NaN if a call fails. */
 FMI2_Export double logged_cost(double h, int steps, const char *path, int logs)
 {
     const fmi2CallbackFunctions callbacks = {NULL, NULL, NULL, NULL, NULL};

@@ -2,16 +2,17 @@
 
     python benchmarks/mpc.py
 
-A move of 1 s from rest to rest with least effort: multiple shooting, 40 intervals of one Runge-Kutta step each, bounds
-on positions, speeds and efforts; 854 variables, 560 constraints. Processor time of the solver, without its set-up.
+The problem is a move of 1 s from rest to rest with least effort: multiple shooting, 40 intervals of one Runge-Kutta
+step each, bounds on positions, speeds and efforts; 854 variables, 560 constraints. Times are processor times of the
+solver, without its set-up.
 
-- Both sides have the same FMU (native, FMI 2.0, effort control, fingers fixed), problem and options of IPOPT. The
-  rival's model description hides `providesDirectionalDerivative`, so that CasADi differences the right-hand side at its
-  defaults. The sides are solved in turns.
+- Both sides have the same FMU (native, FMI 2.0, effort control, fixed fingers), problem and options of IPOPT. For
+  finite differences, the model description lacks `providesDirectionalDerivative`, so that CasADi differences the
+  right-hand side with its defaults. The sides are solved in turns.
 - Hessians: of the objective alone (Gauss-Newton), CasADi's differences of first derivatives (exact), and IPOPT's
   limited-memory BFGS.
-- The FMU runs the plan by `twodof.samples` at rtol 1e-10. Its distance from the plan is the error of Runge-Kutta's
-  fourth order: sixteen steps an interval, with the same efforts, divide it by 16^4.
+- The FMU runs the plan by `twodof.samples` at rtol 1e-10. Its distance from the plan is the error of the Runge-Kutta
+  method of order 4: sixteen steps an interval, with the same efforts, divide it by 16^4.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-/* The default run in MuJoCo, RK4 at 1 ms, and what a step of 10 ms of it costs. In C, since MuJoCo's
-   Python package has the library ask for the time at each stage (mjcb_time), which more than
-   doubles the cost and cannot be undone.
+/* The default run in MuJoCo, RK4 at 1 ms, and the cost of a step of 10 ms. It is in C, because MuJoCo's Python package
+   makes the library read the clock at each stage (mjcb_time), which more than doubles the cost and cannot be undone.
 
        mujoco_step URDF free|controlled STEPS
 
    prints the processor time of a step, s, and the joint angles at the end, rad. The URDF is the
-   shipped arm's without its shapes: there is nothing to collide. Limits are off. The controller is
-   that of the guide's equations, with M, h, J and its drift from MuJoCo, in each of RK4's stages. */
+   shipped arm's without its shapes, so nothing collides. Limits are off. The controller has
+   the tutorial's equations, with M, h, J and its drift from MuJoCo, in each of RK4's stages. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

@@ -2,18 +2,18 @@
 
     python benchmarks/page.py [ARM.html|PLOT.html ...]
 
-Opens each in headless Chromium from its file, without a network, rendering in software in a window
-of 900 × 560; without arguments the pages of the default arm and of a Panda to a pose, and the plot
-of one hour of that Panda at 100 Hz (some minutes). Prints
+It opens each page from its file in headless Chromium, without a network, with software rendering in a window of 900 ×
+560. Without arguments, it makes the pages of the default arm and of a Panda under pose control, and the plot of one
+hour of that Panda at 100 Hz (some minutes). It prints
 
-- size; beside an empty page, the time from navigation until it is ready, and the processor time
-  of that in all of the browser's processes;
-- of an arm that runs: frames a second and processor time a frame; how far the plant fell behind the
-  clock at most, and the longest frame, by which it may;
-- of a target that is dragged: from the event until the frame after the one that shows it begins.
+- the size, and, next to those of an empty page, the time from navigation until the page is ready and the processor time
+  of all browser processes until then;
+- for a running arm: frames a second, processor time of a frame, largest delay of the plant behind the clock, and
+  longest frame, which bounds this delay;
+- for a dragged target: the time from the event until the frame after the one that shows it begins.
 
-A machine that does something else lengthens the times, hardly the processor times. Needs chromium
-and the packages 'playwright', 'psutil' and 'example-robot-data'.
+Other programs lengthen the times, but hardly the processor times. It needs Chromium and the packages 'playwright',
+'psutil' and 'example-robot-data'.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def pages(folder: Path) -> Iterator[Path]:
-    """Make the pages that are measured by default."""
+    """Make the default pages."""
     arm = twodof.build_fmu(folder / "arm.fmu", twodof.FmuOptions(native=True))
     yield twodof.page(arm, folder / "arm.html")
     robot = {
@@ -98,7 +98,7 @@ def pages(folder: Path) -> Iterator[Path]:
 
 
 def measure(chromium: Browser, path: Path) -> None:
-    """Open a page, and print what it costs."""
+    """Open a page, and print its cost."""
     with chromium.new_context(viewport=browser.VIEWPORT, offline=True) as context:
         context.set_default_timeout(1e3 * browser.TIMEOUT)
         page = context.new_page()

@@ -2,17 +2,17 @@
 
     python benchmarks/realtime.py publish|live [SECONDS] [python|native]
 
-Both step the default arm every 10 ms; a second process does nothing but sleep until each 10 ms.
-Prints what both missed.
+Both step the default arm every 10 ms; a second process only sleeps until each 10 ms. It prints the missed deadlines of
+both.
 
-- publish, with its scene on the loopback interface: also the mean of the period and percentiles of
-  its jitter, |period - 10 ms|, of the bare loop, of the samples when they are published, and when a
-  third process receives them. Needs the package 'cyclonedds'.
-- live, behind a page that a browser of nice 19 has open, renders in software and sets the target
-  of; then, for half that time and with a browser of nice 0, how long it takes there from a change
-  of the target to the first change of the arm. Needs chromium, 'websockets' and 'playwright'.
+- publish, with the scene on the loopback interface: also the mean period and percentiles of its jitter, |period - 10
+  ms|, of the bare loop, of the samples when they are published, and when a third process receives them. It needs the
+  package 'cyclonedds'.
+- live, behind a page that a browser of nice 19 renders in software, and whose target it sets; then, for half that time
+  and with a browser of nice 0, the delay from a change of the target to the first change of the arm in the page. It
+  needs Chromium, 'websockets' and 'playwright'.
 
-Have nothing else to do for the machine.
+Run nothing else on the machine.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def bare(seconds: str) -> None:
 
 
 def receive() -> None:
-    """Take JointStates as they come, until there are none for a second."""
+    """Receive JointStates until none arrives for a second."""
     from cyclonedds.core import ReadCondition, SampleState, WaitSet
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.sub import DataReader
@@ -114,7 +114,7 @@ def beside(part: str, *arguments: object) -> subprocess.Popen[str]:
 
 
 class Clock(twodof.Sink):
-    """A sink that notes when samples come."""
+    """A sink that records the arrival times of samples."""
 
     def __init__(self) -> None:
         self.times: list[float] = []

@@ -52,7 +52,7 @@ def machine() -> str:
 
 
 def spent(work: Callable[[], object]) -> tuple[float, float]:
-    """Return the processor time of work, s: of this process, and of children that end during it."""
+    """Return the processor time of some work, s: of this process, and of children that end during it."""
 
     def now() -> list[float]:
         usages = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

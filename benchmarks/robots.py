@@ -4,19 +4,18 @@
     python benchmarks/robots.py panda ur5            those whose path has one of these words
     python benchmarks/robots.py --versions [WORD …]  ten robots in FMI 3.0 and 2.0, about 10 minutes
 
-Prints a table in Markdown, and ends with status 1 where something is wrong.
+It prints a table in Markdown, and returns exit status 1 if a result is wrong.
 
-Each is run for 1 s and logged in both flavours. A robot with several last links is built with the
-first of those that most joints move. "error" is how far the bare plant, thrown at 1 rad/s or m/s a
-joint for 0.1 s without limits at rtol 1e-9, ends from SciPy's DOP853 (Radau where joints are
-damped) on Pinocchio's dynamics, rad or m. Times are processor time for a step of 10 ms of the
-default control at rest on its target, its message in the bag included. Wrong is a URDF that is
-refused for none of the reasons in REFUSED.
+Each robot runs for 1 s and is logged in both flavours. If a robot has several last links, the frame is the first of
+those that most joints move. "error" is the difference of the bare plant from SciPy's DOP853 (Radau for damped joints)
+on Pinocchio's dynamics, rad or m, 0.1 s after a start at 1 rad/s or m/s in each joint, without limits, at rtol 1e-9.
+Times are processor times of a step of 10 ms under the default control at rest on its target, including its message in
+the bag. A URDF that is refused for a reason that is not in REFUSED is wrong.
 
-Versions: each robot under every control is thrown at 0.3 rad/s or m/s a joint, with a force at its
-frame, and steps 10 ms for 1 s, in FMPy's `simulate_fmu`; what is compared, bit for bit, are all
-values of q, v, x and tau, and wrong is one that differs. Ratios are of 3.0 to 2.0: bytes of the
-library, and processor time of a step with its outputs read, the least of interleaved runs.
+Versions: each robot under each control starts at 0.3 rad/s or m/s in each joint, with a force at its frame, and makes
+steps of 10 ms for 1 s in FMPy's `simulate_fmu`. All values of q, v, x and tau are compared bit for bit; a difference is
+wrong. Ratios are of 3.0 to 2.0: bytes of the library, and processor time of a step including reading its outputs, the
+least of interleaved runs.
 """
 
 from __future__ import annotations
@@ -198,7 +197,7 @@ def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
 
 
 def built_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
-    """Yield rows of the table, and True for each that is right."""
+    """Yield rows of the table, each with True if it is right."""
     yield ["URDF", "joints", "frame", "error", "Python, µs a step", "native"], True
     for urdf in sorted(ROBOTS.rglob("*.urdf")):
         name = str(urdf.relative_to(ROBOTS))
@@ -213,7 +212,7 @@ def built_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool
 
 
 def compared_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
-    """Yield rows of the table, and True for each that is right."""
+    """Yield rows of the table, each with True if it is right."""
     yield ["URDF", "joints", "frame", "control", "equal", "moved", "bytes", "time"], True
     for name in COMPARED:
         for control in CONTROLS if not words or any(word in name for word in words) else ():
@@ -222,7 +221,7 @@ def compared_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], b
 
 
 def main() -> int:
-    """Print the table; 1 where something is wrong."""
+    """Print the table; return 1 if a result is wrong."""
     logging.disable(logging.WARNING)
     words = [word for word in sys.argv[1:] if word != "--versions"]
     rows = compared_rows if words != sys.argv[1:] else built_rows

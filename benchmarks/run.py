@@ -2,10 +2,9 @@
 
     python benchmarks/run.py
 
-The parts, which can be run alone too, are ``steps.py``, ``engine.py`` and ``around.py``; each says
-at its top how it measures, and prints more than the table has. All is processor time, and what is
-compared takes turns. Takes six minutes or more, 1.3 GB of disk, the packages of the extra "test"
-and a C compiler.
+The parts ``steps.py``, ``engine.py`` and ``around.py`` also run alone. The docstring of each describes its method, and
+each prints more than the table has. Times are processor times, and compared programs take turns. It takes six minutes
+or more, 1.3 GB of disk, the packages of the extra "test" and a C compiler.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Cost of a system of plant and controller, native FMUs, logged by ``twodof.simulate``, beside the two engines' time.
+"""Cost of a logged step of a system of plant and controller, relative to the two engines.
 
     python benchmarks/split.py [TURNS]
 
-The engines' time is that of ``system_step.c``, which loads the two FMUs, connects them in C, and does nothing else; it
-must end at the same joint angles. A run has a bag, MCAP without fsync. Processor time of all threads; the two take
-turns, and ratios are medians over the turns. Needs a C compiler. Takes less than a minute.
+The engines' time is that of ``system_step.c``, which only loads the two native FMUs and connects them in C; it must end
+at the same joint angles. A run of ``twodof.simulate`` has a bag, MCAP without fsync. Times are processor times of all
+threads; both programs take turns, and ratios are medians over the turns. It needs a C compiler and takes less than a
+minute.
 """
 
 from __future__ import annotations

@@ -2,15 +2,14 @@
 
     python benchmarks/steps.py
 
-Simulators take turns of ten steps, loggers turns of some thousand messages, so that noise of the
-machine hits all alike; times are medians, of processor time: on an idle machine it is the wall
-time, on a busy one a long step is interrupted more often than a short one, which would flatter the
-short ones.
+Simulators take turns of ten steps, loggers turns of some thousand messages, so that the machine's noise affects all of
+them. Times are medians of processor time. On an idle machine this is the wall time; on a busy one, wall time would
+favour short steps, because long ones are interrupted more often.
 
-Ratios depend on the processor, which is printed. Beside its time each simulator has its distance
-from the exact solution, so that nobody compares the speed of things that compute something else: in
-the default run both task axes obey e'' + 40 e' + 50 e = 0 for the error e, which has a closed form.
-Needs the packages of the extra "test", and a C compiler. Takes less than a minute.
+Ratios depend on the processor, which is printed. Each simulator also has its distance from the exact solution, so that
+no incorrect program is compared by speed alone: in the default run the error e of each task axis obeys e'' + 40 e' + 50
+e = 0, which has a closed form. It needs the packages of the extra "test" and a C compiler, and takes less than a
+minute.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ FMU_BAR, NATIVE_BAR = 5.0, 300.0
 
 
 class Simulator(Protocol):
-    """Something that advances the default run; ``restart`` comes before the first step."""
+    """A program that advances the default run; ``restart`` is called before the first step."""
 
     def restart(self) -> None: ...
     def step(self, k: int) -> None:
@@ -159,8 +158,8 @@ def step_times(simulators: Sequence[Simulator], passes: int = PASSES) -> list[fl
 def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
     """Measure the time of one JointState in bare rosbags and in this package's bag, s, by storage.
 
-    Medians over bags written in turns, from the first message to the closed file, in processor
-    time of all threads: this package's bag stores in one of its own.
+    Times are medians over bags written in turns, from the first message to the closed file, in processor time of all
+    threads, because this package's bag stores in a thread.
     """
     run = twodof.experiment(fmu)
     first = twodof.Sample(0, 0.0, (0.5, 0.35), (0.1, 0.2), (0.2, 0.1), (1.0, 0.3), {}, 0.0, 0)
@@ -183,7 +182,7 @@ def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
 
 
 def log_time(stack: ExitStack, write: Callable[[Any], None], items: Sequence[Any]) -> float:
-    """Measure the processor time of one message, s: of writing all and closing the bag on the stack."""
+    """Measure the processor time of one message, s: writing all messages, and closing the bag on the stack."""
     begin = time.process_time()
     for item in items:
         write(item)
@@ -192,7 +191,7 @@ def log_time(stack: ExitStack, write: Callable[[Any], None], items: Sequence[Any
 
 
 def bare_rosbags(stack: ExitStack, path: Path, storage: str) -> Callable[[int], None]:
-    """Return a function that writes one message, always the same, at a stamp."""
+    """Return a function that writes the same message at a stamp."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "sensor_msgs/msg/JointState"
     header = store.types["std_msgs/msg/Header"](

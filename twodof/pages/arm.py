@@ -46,7 +46,7 @@ CONTAINER = b'<div class="arm" id="arm"'
 
 
 def names_page(path: Path) -> bool:
-    """Return whether a path has the suffix of a page after a name."""
+    """Return whether a path may name a page: a name with a suffix of a page, or without a suffix."""
     return path.suffix.lower() in PAGES and (bool(path.suffix) or not path.name.startswith("."))
 
 
