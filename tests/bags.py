@@ -68,14 +68,14 @@ except twodof.TwoDofError as error:
 
 
 class Logging(NamedTuple):
-    """A run in real time, in a process of its own, that notes when it makes its samples."""
+    """A run in real time, in its own process, that records the times of its samples."""
 
     process: subprocess.Popen[str]
     clock: Path
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """Return for each sample s of the time in which the process ran."""
+        """Return, for each sample, the time in s for which the process had run."""
         times = np.fromfile(self.clock, "<f8")
         return times[times > 0.0]
 
@@ -86,7 +86,7 @@ class Logging(NamedTuple):
 
 
 def logging(fmu: Path, bag: Path, storage: str) -> Logging:
-    """Begin a run that has no end; its first sample is there."""
+    """Start a run without end, and wait for its first sample."""
     clock = bag.with_name(f"{bag.name}.clock")
     clock.write_bytes(bytes(8 * 100_000))
     command = [sys.executable, "-c", LOGGER, *map(str, (fmu, bag, storage, clock, START))]
@@ -117,7 +117,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 class JointState(NamedTuple):
-    """A message as some reader gives it; numbers as bytes, so that equal means bit-identical."""
+    """A message as a reader returns it; numbers are bytes, so that equal means bit-identical."""
 
     log_time: int
     stamp: int
@@ -135,7 +135,7 @@ def run(native_path: Path) -> Experiment:
 
 
 def sample(run: Experiment, k: int) -> Sample:
-    """A sample that no simulation gave, told apart by its numbers."""
+    """An artificial sample, identified by its numbers."""
     inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
     numbers = (k / 7, -k / 3), (k / 11, -k), (k, k), (k / 13, k / 17)
     return Sample(k, run.time(k), *numbers, inputs, 0.0, START * SECOND + k * PERIOD)
@@ -173,7 +173,7 @@ def read_with_rosbags(bag: Path) -> list[JointState]:
 
 
 def read_with_mcap(bag: Path) -> list[JointState]:
-    """Through the index, and decoded by the schema that the file carries."""
+    """Read a bag by its index, and decode it by the file's own schema."""
     with (bag / f"{bag.name}.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         states = []
@@ -208,7 +208,7 @@ def header(stamp: int, frame: str = "") -> Any:
 
 
 def joint_message(stamp: int, names: Sequence[str], *numbers: Sequence[float] | np.ndarray, frame: str = "") -> Any:
-    """A JointState with positions, velocities and efforts, as far as they are given."""
+    """A JointState with the given positions, velocities and efforts."""
     parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
     return STORE.types["sensor_msgs/msg/JointState"](header(stamp, frame), [*names], *parts)
 
@@ -220,7 +220,7 @@ def serialised(message: Any, *, little_endian: bool = True) -> bytes:
 def write_third_party(
     path: Path, messages: Iterable[tuple[str, int, Any]], *, zstd: bool = False, **options: Any
 ) -> Path:
-    """A bag that rosbags alone writes, of (topic, log time, message)."""
+    """Write a bag of (topic, log time, message) with rosbags alone."""
     writer = Writer(path, **{"version": 9, **options})
     if zstd:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -240,7 +240,7 @@ def metadata(bag: Path) -> dict[str, Any]:
 
 
 def assert_consistent(bag: Path, storage: str) -> int:
-    """The bag opens in all readers of its storage, with as many messages as its metadata says."""
+    """Assert that all readers of its storage open the bag, with as many messages as its metadata states."""
     with Reader(bag) as reader:
         stamps = [stamp for _, stamp, _ in reader.messages()]
         counts = {c.topic: c.msgcount for c in reader.connections}

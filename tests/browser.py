@@ -1,4 +1,4 @@
-"""A browser on a page of ``twodof view`` or ``twodof live``, and the command behind the page."""
+"""A browser on a page of ``twodof view`` or ``twodof live``, and the command that serves the page."""
 
 import io
 import json
@@ -98,7 +98,7 @@ LATENCY = """([label, text, row]) => new Promise(resolve => {
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A headless browser that renders in software."""
+    """A headless browser with software rendering."""
     program = needs("chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS, timeout=1e3 * TIMEOUT)
@@ -128,7 +128,7 @@ def opened(
 
 
 class Served:
-    """A command with a page: started, its URL read; ended by Ctrl-C."""
+    """A command that serves a page: started, its URL read; ended by Ctrl-C."""
 
     def __init__(self, *arguments: str | Path, cwd: Path, port: int = 0) -> None:
         self.process = subprocess.Popen(
@@ -148,13 +148,13 @@ class Served:
         self.url = found[1]
 
     def interrupt(self, number: int = signal.SIGINT) -> tuple[int, str, str]:
-        """Ctrl-C; exit status and what was printed on stdout and stderr."""
+        """Send Ctrl-C; return the exit status and the texts on stdout and stderr."""
         self.process.send_signal(number)
         output, errors = self.process.communicate(timeout=TIMEOUT)
         return self.process.returncode, output, errors
 
     def children(self) -> list[int]:
-        """Processes that it has started."""
+        """Its child processes."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
         return [int(word) for word in children.read_text().split()]
 
@@ -166,7 +166,7 @@ class Served:
 
 @contextmanager
 def served(*arguments: str | Path, cwd: Path, port: int = 0) -> Iterator[Served]:
-    """A command that is asked to end, if it still runs, and so removes its temporary folder."""
+    """A command that is asked to end if it still runs, so that it removes its temporary folder."""
     command = Served(*arguments, cwd=cwd, port=port)
     try:
         yield command
@@ -185,7 +185,7 @@ def socket_of(url: str) -> str:
 
 
 def connect(url: str) -> None:
-    """Connect as a browser does that has the page open, and leave at once."""
+    """Connect as a browser with the open page does, and disconnect at once."""
     with websockets.sync.client.connect(socket_of(url)) as connection:
         connection.recv()
         time.sleep(0.1)
@@ -203,7 +203,7 @@ NOBODY = 65534
 
 
 def connected(url: str, host: str) -> socket.socket:
-    """A connection by a program that is not root's: the owner of a socket is who makes it."""
+    """A connection by a program of another user than root, to whom the socket belongs."""
     root = os.geteuid() == 0
     if root:
         os.seteuid(NOBODY)
@@ -225,7 +225,7 @@ def answer(url: str, *headers: tuple[str, str], path: str = "/") -> int:
 
 
 def hostile_arm() -> ET.Element:
-    """The default arm's URDF, all of whose names begin with HOSTILE, with spheres for meshes."""
+    """The URDF of the default arm with spheres for meshes, and with names that begin with HOSTILE."""
     robot = ET.parse(Path(__file__).parents[1] / "urdf/2dof.urdf").getroot()
     for element in robot.iter():
         for key in {"name", "link"} & element.attrib.keys():
@@ -238,7 +238,7 @@ def hostile_arm() -> ET.Element:
 
 
 def assert_shown_as_text(page: Page, *texts: str) -> None:
-    """HOSTILE and what follows are seen to the letter, and nothing of it is an element or runs."""
+    """Assert that HOSTILE and the text after it are shown literally, and that no part becomes an element or runs."""
     page.wait_for_timeout(500)  # a script would run by now
     assert page.title() != "ran"
     for text in texts:
@@ -247,12 +247,12 @@ def assert_shown_as_text(page: Page, *texts: str) -> None:
 
 
 def rows(page: Page) -> dict[str, str]:
-    """All of the readout at one moment, and its time."""
+    """The readout at one moment, and its time."""
     return page.evaluate(ROWS)
 
 
 def samples(page: Page) -> np.ndarray:
-    """All samples, N × what each holds; as text, which takes a browser less time than numbers."""
+    """All samples, N × values; as text, which the browser transfers faster than numbers."""
     held = "[...arm.data.subarray(0, arm.count * arm.width)]"
     width, text = page.evaluate(f"[arm.width, JSON.stringify({held})]")
     return np.array(json.loads(text)).reshape(-1, width)
@@ -264,7 +264,7 @@ def numbers(text: str) -> list[float]:
 
 
 def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], Any] = rows) -> Any:
-    """Return a page's text, by default its readout, once it fulfils a condition."""
+    """Return a page's text, by default its readout, when it meets a condition."""
     end = time.monotonic() + TIMEOUT
     while not condition(found := look(page)):
         assert time.monotonic() < end, found
@@ -273,18 +273,18 @@ def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], A
 
 
 def at_rest(page: Page) -> dict[str, str]:
-    """The readout once the arm stands still and all is shown."""
+    """The readout when the arm is at rest and everything is shown."""
     until(page, bool, lambda page: page.evaluate(AT_REST))
     return rows(page)
 
 
 def press(page: Page, name: str) -> None:
-    """Press a button whose label begins so."""
+    """Press a button whose label begins with a text."""
     page.get_by_role("button", name=re.compile(f"^{name}")).first.click()
 
 
 def type_into(page: Page, label: str, value: float) -> None:
-    """Type a number into the field of that label."""
+    """Type a number into the field with a label."""
     field = page.get_by_label(label, exact=True)
     field.evaluate("(field) => { field.closest('details').open = true; }")
     field.fill(f"{value:g}")
@@ -303,13 +303,13 @@ def picture(page: Page) -> np.ndarray:
 
 
 def still(page: Page) -> np.ndarray:
-    """The same of a page whose time stands still, and so draws nothing."""
+    """The same for a page whose time stands still, so that it draws nothing."""
     shot = page.screenshot(clip=page.locator("canvas").first.bounding_box(), style=NOTES)
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
 
 def target_place(page: Page) -> tuple[float, float]:
-    """The middle of the target's ball in the window, on a page with an arm in it."""
+    """The centre of the target's ball in the window, on a page with an arm."""
     ball = pixels(picture(page), lambda r, g, b: (r - b > 100) & (g < 105) & (r < 225))
     box = page.locator("canvas").first.bounding_box()
     assert box is not None
@@ -318,14 +318,14 @@ def target_place(page: Page) -> tuple[float, float]:
 
 
 def pixels(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
-    """The largest patch of a picture whose red, green and blue are as asked; x and y, N × 2."""
+    """The largest patch of pixels whose red, green and blue meet the conditions; x and y, N × 2."""
     patches, count = ndimage.label(seen(*np.moveaxis(shown.astype(int), -1, 0)))
     assert count > 0
     return np.argwhere(patches == np.bincount(patches.flat)[1:].argmax() + 1)[:, ::-1]
 
 
 def area(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
-    """The convex hull of all such pixels but the loneliest: what is before them leaves no gap."""
+    """The convex hull of all such pixels except isolated ones; objects in front of them leave no gap."""
     points = np.argwhere(ndimage.binary_opening(seen(*np.moveaxis(shown.astype(int), -1, 0))))
     hull = Image.new("1", shown.shape[1::-1])
     corners = points[ConvexHull(points).vertices, ::-1]

@@ -31,7 +31,7 @@ from twodof.cli import printing
 def pytest_configure(config: pytest.Config) -> None:
     """Start as from a shell in the foreground, with the environment activated.
 
-    A shell's background job ignores Ctrl-C, and so would all that tests start.
+    A shell's background job ignores Ctrl-C, and so would all processes that tests start.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     printing.MOMENT = 600.0  # s: no command tells a test how slow a busy machine is
@@ -80,10 +80,10 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the files that take longest, so that the processes end at about one time.
+    """Start with the files that take longest, so that the processes end at about the same time.
 
-    Eight files at a time are in the shuffled order. The tests of a file that need its page are
-    the last ones: a page that is shown draws beside all that runs.
+    Groups of eight files are in the shuffled order. Tests that need a file's page come last, because an open page draws
+    while other tests run.
     """
     place = {f"test_{name}.py": i // 8 for i, name in enumerate(LONGEST)}
 
@@ -119,7 +119,7 @@ def folder(tmp_path: Path, fmu_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    """Mounts a small disk of so many KiB, as often as asked."""
+    """Mount a small disk of some KiB, as often as requested."""
     mounted: list[Path] = []
 
     def mount(size: int, options: str = "rw") -> Path:
@@ -140,7 +140,7 @@ def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
 
 @pytest.fixture(scope="session")
 def robots() -> Path:
-    """Folder of the URDFs of example-robot-data, one folder a robot."""
+    """Folder of the URDFs of example-robot-data, one folder per robot."""
     files = importlib.metadata.files("example-robot-data") or []
     urdf = next(file for file in files if file.parts[-4:-2] == ("robots", "panda_description"))
     return Path(str(urdf.locate())).parents[2]
@@ -154,10 +154,9 @@ def ur5(robots: Path) -> str:
 
 @pytest.fixture(scope="session")
 def panda(robots: Path) -> str:
-    """URDF text of the Panda arm, seven joints: its fingers fixed, without joint damping.
+    """URDF text of the Panda arm with seven joints: fixed fingers, no joint damping.
 
-    The second finger mimics the first, which is refused; and damping, which the controller does
-    not compensate, would leave no closed form to compare with.
+    The second finger mimics the first. Damping, which the controller does not compensate, has no closed form.
     """
     tree = ET.fromstring((robots / "panda_description/urdf/panda.urdf").read_text())
     for joint in tree.findall("joint"):

@@ -22,7 +22,7 @@ COARSE = {"control_period": 0.001, "q_resolution": (0.05, 0.05), "v_from_q": Tru
 
 
 class Failure(NamedTuple):
-    """A run, and what its verdict has to say."""
+    """A run, and the expected content of its verdict."""
 
     robot: str
     control: str
@@ -200,7 +200,7 @@ FIRM = {"Kp": 100.0, "Kd": 20.0, **LARGE_STEPS}
 
 @cache
 def fmu_of(robot: str, control: str) -> Path:
-    """Build an FMU of the Python flavour, once a process, that starts away from limits and singularities."""
+    """Build a Python FMU, once per process, that starts away from limits and singularities."""
     folder = run_folder() / "verdict"
     folder.mkdir(exist_ok=True)
     options: dict[str, Any] = {"control": control, "meshes": False}
@@ -223,7 +223,7 @@ def bent(text: str) -> tuple[float, ...]:
 
 
 def good_runs(robot: str) -> Iterator[twodof.Experiment]:
-    """Yield runs to a position near, to joint positions, at rest, and along a circle."""
+    """Yield runs to a near position, to joint positions, at rest, and along a circle."""
     task, joint = twodof.load_fmu(fmu_of(robot, "task")), twodof.load_fmu(fmu_of(robot, "joint"))
     starts = task.start_values
     x = np.array(next(twodof.samples(task)).x)

@@ -31,7 +31,7 @@ def heights(axes: Axes, label: str) -> list[float]:
 
 
 def legend_of(axes: Axes) -> list[str]:
-    """Its own, or that of its part of the figure."""
+    """Return the legend of the panel, or of its part of the figure."""
     own = axes.get_legend()
     (found,) = [own] if own else axes.figure.legends
     return [text.get_text() for text in found.get_texts()]
@@ -56,12 +56,12 @@ def panels(figure: Figure) -> Panels:
 
 
 def texts(figure: Figure) -> list[str]:
-    """Line by line."""
+    """Return texts line by line."""
     return [line for text in figure.findobj(Text) for line in text.get_text().splitlines()]
 
 
 def key(figure: Figure) -> Legend:
-    """The labels that tell tracks apart."""
+    """Return the labels that distinguish tracks."""
     (legend,) = figure.subfigs[0].legends
     return legend
 
@@ -75,7 +75,7 @@ def notes(axes: Axes) -> list[str]:
 
 
 def boxes(figure: Figure) -> list[tuple[Text, Any]]:
-    """All texts that are seen and the boxes around them, in pixels."""
+    """Return all visible texts and their bounding boxes, in pixels."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     ticks = {}
@@ -94,7 +94,7 @@ def boxes(figure: Figure) -> list[tuple[Text, Any]]:
 
 
 def assert_legible(figure: Figure) -> None:
-    """No text is cut off, none lies on another, and none is smaller than 5 pt on an A4 page."""
+    """Assert that no text is cut off, overlaps another, or is smaller than 5 pt on an A4 page."""
     seen = boxes(figure)
     assert len(seen) > 10
     width, height = figure.canvas.get_width_height()

@@ -1,8 +1,8 @@
 """Event-driven reference solution of joints with friction and stops, by Pinocchio and SciPy.
 
-It shares no code with the plant. In a mode each joint slips in a direction, rests by its friction, or rests at a stop;
-DOP853 integrates the motion in it up to the first event, and the next mode is the one, of all that there are for the
-joints at rest, that fulfils the conditions of friction and stops.
+It shares no code with the plant. In a mode, each joint slips in a direction, rests by friction, or rests at a stop.
+DOP853 integrates the motion up to the first event. The next mode is the only one, among all modes of the joints at
+rest, that meets the conditions of friction and stops.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Rubbing:
         return M + np.triu(M, 1).T + np.diag(self.armature)
 
     def motion(self, q, v, mode):
-        """q̈ in a mode, an element of which is 1 or −1 of a joint that slips, 0 of one that rests; and λ of these."""
+        """q̈ in a mode, which has 1 or −1 for a joint that slips and 0 for a joint at rest; and λ of joints at rest."""
         state = (q.tobytes(), v.tobytes(), mode.tobytes())
         if self._last[0] == state:  # events of one time
             return self._last[1]
@@ -65,7 +65,7 @@ class Rubbing:
         return np.where(at_high, -np.inf, -self.friction), np.where(at_low, np.inf, self.friction)
 
     def mode_at(self, q, v):
-        """The mode in which a motion goes on from a state after an impact."""
+        """The mode in which a motion continues from a state after an impact."""
         still = np.flatnonzero(v == 0.0)
         least, most = self.bounds(q)
         best, chosen = -np.inf, None

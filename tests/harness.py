@@ -1,4 +1,4 @@
-"""An FMU driven call by call through FMPy, and tests that run in a process of their own."""
+"""An FMU driven call by call through FMPy, and tests that run in their own process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tools import needs
 
 
 def shared(factory, name, make):
-    """A folder for all processes of a run of the tests, filled by the first that asks for it."""
+    """A folder for all processes of a test run, filled by the first one that requests it."""
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
     with open(f"{folder}.lock", "w") as lock:
@@ -50,7 +50,7 @@ FRESH.set_forkserver_preload(["fmpy.fmi2", "hypothesis", "pinocchio", "pytest", 
 
 
 def in_child_process(test):
-    """Run a test in a fresh process: a crash there is a failure here, and nothing is shared."""
+    """Run a test in a new process: a crash there is a failure here, and nothing is shared."""
 
     @functools.wraps(test)
     def run(*arguments, **named):
@@ -68,9 +68,9 @@ LOGGERS = list[Any]()
 
 
 def lasting(method):
-    """Return a logger that lives as long as the process, for a weak reference to a method.
+    """Return a logger that lives as long as the process and holds a weak reference to a method.
 
-    FMPy's proxy passes the messages of all FMUs to the logger that was added last, whether it lives or not.
+    FMPy's proxy passes the messages of all FMUs to the latest logger, whether it still exists or not.
     """
     LOGGERS.append(fmi2.fmi2CallbackLoggerTYPE(lambda *message: (log := method()) and log(*message)))
     return LOGGERS[-1]
@@ -83,7 +83,7 @@ def python(*arguments, check=False, timeout=300, **options):
 
 
 class Worker:
-    """A process for many calls; a call that ends it or hangs fails, and the next has a new one."""
+    """A process for many calls; a call that ends it or hangs fails, and the next call has a new process."""
 
     def __init__(self):
         self._start()
@@ -120,7 +120,7 @@ def _serve(pipe):
 
 
 def lay_traps(folder):
-    """Modules that nobody must import, by every name that this process knows."""
+    """Write modules that must not be imported, by every name that this process knows."""
     names = {*sys.stdlib_module_names, *(name.partition(".")[0] for name in sys.modules)}
     for name in {*names, "sitecustomize", "usercustomize"} - {"__main__", "program"}:
         with open(os.path.join(folder, f"{name}.py"), "w") as file:
@@ -128,13 +128,13 @@ def lay_traps(folder):
 
 
 def asked(times):
-    """Asks to stop when it is looked at so many times: what never looks would hang."""
+    """A callable that returns True after some calls; code that never calls it would hang."""
     looks = itertools.count(1)
     return lambda: next(looks) >= times
 
 
 def wait_until(condition):
-    """A hang fails the test."""
+    """Wait for a condition; a hang fails the test."""
     end = time.monotonic() + 120.0
     while not condition():
         assert time.monotonic() < end
@@ -142,7 +142,7 @@ def wait_until(condition):
 
 
 def children_of(process):
-    """Processes that it has started, and that have not ended."""
+    """Child processes that have not ended."""
     found: list[int] = []
     for children in Path(f"/proc/{process}/task").glob("*/children"):
         with contextlib.suppress(OSError):
@@ -151,7 +151,7 @@ def children_of(process):
 
 
 def _tracks(process):
-    """Return True for the process that multiprocessing starts once and leaves until the end."""
+    """Return True for the process that multiprocessing starts once and keeps until the end."""
     return b"resource_tracker" in Path(f"/proc/{process}/cmdline").read_bytes()
 
 
@@ -167,9 +167,9 @@ _description = functools.cache(fmpy.read_model_description)
 
 
 class Recorded:
-    """A mixin of FMPy's instances: messages are kept, what is refused is seen to change nothing.
+    """A mixin for FMPy's instances that keeps messages and checks that refused calls change nothing.
 
-    The classes' names begin with the version of FMI, which FMPy looks for there.
+    The classes' names begin with the version of FMI, which FMPy looks for.
     """
 
     if TYPE_CHECKING:  # what FMPy's class has
@@ -198,7 +198,7 @@ class Recorded:
         return 0
 
     def refused(self, message, function, *arguments):
-        """The call is refused with this message, a pattern, alone."""
+        """Assert that the call is refused with only this message, a pattern."""
         before, self.messages = self.snapshot(), []
         assert self.status(function, *arguments) == fmi2.fmi2Error
         ((status, text),) = self.messages
@@ -219,7 +219,7 @@ def unzipped(fmu):
 
 @contextlib.contextmanager
 def wine(folder):
-    """Yield the command and the environment that run programs of Windows; its server ends too."""
+    """Yield the command and the environment that run Windows programs; its server ends too."""
     command, server = needs("wine"), needs("wineserver")
     environment = {
         **os.environ,
@@ -236,9 +236,9 @@ def wine(folder):
 
 
 class Driver:
-    """One instance; ``log`` collects (status, message), ``status`` is that of the last call.
+    """One instance; ``log`` collects (status, message), and ``status`` is that of the last call.
 
-    ``folder`` is where the FMU is unzipped already, if it is.
+    ``folder`` is that of an FMU that is already unzipped.
     """
 
     def __init__(self, fmu, folder=None, guid=None):
@@ -265,7 +265,7 @@ class Driver:
         self.log.append((status, message.decode()))
 
     def call(self, name, *arguments, **named):
-        """Call a method of FMPy's slave; what it returns, with ``status`` set."""
+        """Call a method of FMPy's slave, set ``status``, and return the method's result."""
         self.status = 0
         try:
             return getattr(self.slave, name)(*arguments, **named)
@@ -274,7 +274,7 @@ class Driver:
             return None
 
     def set(self, **values):
-        """``x_des=(0.1, 0.2)`` sets a vector, ``Kn=1.0`` a scalar."""
+        """Set variables: ``x_des=(0.1, 0.2)`` a vector, ``Kn=1.0`` a scalar."""
         for group, value in values.items():
             setter = (
                 "setBoolean"
@@ -309,7 +309,7 @@ class Driver:
         return self.status
 
     def run(self, count, start=0, h=0.01):
-        """Outputs after each of ``count`` steps from step ``start`` on."""
+        """Return outputs after each of ``count`` steps from step ``start`` on."""
         rows = []
         for k in range(start, start + count):
             assert self.step(k * h, h) == 0, self.log
@@ -336,14 +336,14 @@ def forged(fmu, folder, pattern, text):
 
 
 def changed_step(fmu_path, folder, lines):
-    """The default FMU, whose plant does this before each step, or in its place."""
+    """The default FMU, whose plant runs some code before each step, or instead of it."""
     body = indent(dedent(lines).strip(), "    ")
     code = f"step = Plant.step\n\ndef changed(self, *times):\n{body}\n    step(self, *times)\n"
     return changed_plant(fmu_path, folder, f"{code}\nPlant.step = changed\n")
 
 
 def changed_plant(fmu_path, folder, code):
-    """The default FMU with code of ours behind that of its plant, under another digest."""
+    """The default FMU with code appended to that of its plant, under another digest."""
     other = folder / "Changed.fmu"
     with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
         (tag,) = {m[1] for n in archive.namelist() if (m := re.search(r"slave_(\w+)\.py", n))}

@@ -106,7 +106,7 @@ def bag_of(path: Path, joints: Sequence[str], q: Array, effort: Array | None, st
 
 
 def assert_true(result: twodof.Fit, truth: dict[str, float]) -> None:
-    """Each parameter is within three standard deviations, and within 3 % where these say so."""
+    """Assert that each parameter is within three standard deviations, and within 3 % if these are smaller."""
     assert truth.keys() == {p.name for p in result.parameters}
     for p in result.parameters:
         assert p.known and abs(p.after - truth[p.name]) <= 3.0 * p.deviation, (p, truth[p.name])

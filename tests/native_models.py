@@ -101,7 +101,7 @@ def model(name: str, control: str = "task") -> Model:
 
 
 def urdf_path(name: str) -> Path:
-    """The URDF of the shipped arm, or of a robot of ROBOTS, or one below robots_folder()."""
+    """The URDF of the shipped arm, of a robot of ROBOTS, or of a path below robots_folder()."""
     if name == "twodof":
         return ROOT / "urdf" / "2dof.urdf"
     return robots_folder() / (ROBOTS[name][0] if name in ROBOTS else name)
@@ -114,7 +114,7 @@ def last_link(name: str) -> str:
 
 
 def coupling(name: str, joints: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """G and c of the positions G q + c of joints, else Pinocchio's, from <mimic> alone."""
+    """G and c of the positions G q + c of joints, from <mimic> and not from Pinocchio."""
     names = list(joints or model(name).robot.model.names)[0 if joints else 1 :]
     mimics = {
         str(joint.get("name")): mimic
@@ -132,7 +132,7 @@ def coupling(name: str, joints: Sequence[str] = ()) -> tuple[np.ndarray, np.ndar
 
 
 class Reduced:
-    """Pinocchio's answers in the coordinates of the joints that move on their own."""
+    """Pinocchio's results in the coordinates of the independent joints."""
 
     def __init__(self, reference: pin.Model, name: str, armature: Sequence[float] | None = None) -> None:
         self.model, self.data = reference, reference.createData()
@@ -170,9 +170,9 @@ def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
 
 
 def library(name: str, control: str = "task") -> Path:
-    """The shared library of a model's FMU, as it is shipped.
+    """The shared library of a model's FMU, as shipped.
 
-    Written once: a library that is written anew while it is loaded crashes the next dlopen.
+    It is written once: if a loaded library is overwritten, the next dlopen crashes.
     """
     folder = SCRATCH / f"{name}-{control}"
     with written_once(folder) as begun:
@@ -184,7 +184,7 @@ def library(name: str, control: str = "task") -> Path:
 
 @contextmanager
 def written_once(folder: Path) -> Iterator[Path | None]:
-    """A folder to write what is to be in another, which it becomes; none where that is there."""
+    """A temporary folder that becomes another one at the end; None if that exists."""
     if folder.exists():
         yield None
         return
@@ -209,7 +209,7 @@ class Engine:
         return getattr(self.lib, f"probe_{name}")(*values)
 
     def task(self, q, v):
-        """Position, Jacobian and drift in the rows of the task."""
+        """Position, Jacobian and drift in the task rows."""
         rows = self.m + 3 * (self.model.control == "pose")
         x, J, drift = np.empty(self.m), np.empty((rows, self.n)), np.empty(rows)
         self.call("task", q, v, x, J, drift)
@@ -231,13 +231,13 @@ class Engine:
         return a
 
     def failure(self) -> tuple[int, int, float]:
-        """Why the last step was refused: the reason, the fastest joint, its rate in 1/s."""
+        """The refusal of the last step: the reason, the fastest joint, and its rate in 1/s."""
         row = np.empty(3)
         self.call("failure", row)
         return int(row[0]), int(row[1]), float(row[2])
 
     def values(self, plant: Plant) -> np.ndarray:
-        """All variables of a Python plant by value reference; what is computed is 0."""
+        """All variables of a Python plant by value reference; computed ones are 0."""
         row = []
         for variable in self.model.table:
             if variable.causality in ("output", "local") and variable.group not in ("q", "v"):
@@ -277,8 +277,7 @@ def shipped(of: Engine, **changes: object) -> Plant:
 
 
 def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2) -> Path:
-    """C files of the tests, which include the FMU's, compiled by the machine's own compiler;
-    headers of the tests lie beside."""
+    """C files of the tests, which include the FMU's, compiled by the machine's own compiler with the tests' headers."""
     files = of.sources(*more, fmi=fmi)
     digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
     folder = SCRATCH / digest
@@ -316,12 +315,12 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
 
 
 def deviation(a, b) -> float:
-    """The largest difference, of the largest of b or of one."""
+    """The largest difference, relative to the largest of b or to 1."""
     return np.abs(np.subtract(a, b)).max() / max(1.0, np.abs(b).max())
 
 
 def loaded(plant) -> pin.Model:
-    """Pinocchio's model with the payload as a body of its own."""
+    """Pinocchio's model with the payload as a separate body."""
     robot = plant.robot
     reference = robot.model.copy()
     reference.gravity.linear = np.array(plant.gravity)

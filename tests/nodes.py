@@ -1,7 +1,7 @@
-"""Fast DDS nodes and ``twodof publish`` in processes of their own, and the messages of a bag.
+"""Fast DDS nodes and ``twodof publish`` in their own processes, and the messages of a bag.
 
-The nodes are another maker's DDS, with an IDL of its own; bags are read by the MCAP project's
-reader. All stays on the loopback interface, or in network namespaces that lead nowhere.
+The nodes use another DDS implementation with its own IDL; the MCAP project's reader reads bags. All traffic stays on
+the loopback interface, or in network namespaces without a route out.
 """
 
 import json
@@ -72,7 +72,7 @@ def number() -> Iterator[int]:
 
 
 class Node:
-    """A Fast DDS node that listens to topics, or talks on those of COMMANDS."""
+    """A Fast DDS node that listens to topics, or writes to those of COMMANDS."""
 
     def __init__(self, program: Path, number: int, *topics: str, inside: tuple[str, ...] = ()):
         command = [*inside, str(program), str(number), *topics]
@@ -90,7 +90,7 @@ class Node:
                 self.told.append(json.loads(line))
 
     def messages(self, topic: str) -> list[Any]:
-        """Fields of what came on a topic."""
+        """Fields of the received messages of a topic."""
         return [it[3] for it in self.told if it[:2] == ["message", topic]]
 
     def until(self, condition: Callable[[], Any], timeout: float = TIMEOUT) -> None:
@@ -100,7 +100,7 @@ class Node:
             time.sleep(0.02)
 
     def sees(self, last: Any, topic: str = "/joint_states") -> None:
-        """Wait for a message, which is the last so far."""
+        """Wait for a message that is the last so far."""
         self.until(lambda: self.messages(topic)[-1:] == [last])
 
     def hears(self, topic: str = "/joint_states", more: int = 5) -> None:
@@ -109,7 +109,7 @@ class Node:
         self.until(lambda: len(self.messages(topic)) >= before + more)
 
     def point(self, topic: str, frame: str, *xyz: float) -> None:
-        """Send a point to somebody who listens."""
+        """Send a point to a listener."""
         self.say(f"{topic} {frame or '-'} {' '.join(map(repr, xyz))}")
 
     def leads(self, topic: str, *xyz: float) -> None:
@@ -118,8 +118,11 @@ class Node:
         self.insists(line, lambda: self.messages("/target")[-1:] and self.messages("/target")[-1][1] == list(xyz))
 
     def insists(self, line: str, condition: Callable[[], Any]) -> None:
-        """Send a message until the condition holds: a reader may discover a writer seconds later than
-        the writer discovers the reader, and what comes before is lost."""
+        """Send a message until a condition holds.
+
+        A reader may discover a writer seconds after the writer has discovered the reader, and earlier messages are
+        lost.
+        """
 
         def holds() -> bool:
             self.say(line)
@@ -131,7 +134,7 @@ class Node:
         self.until(holds)
 
     def say(self, line: str) -> None:
-        """Send a message to somebody who listens on its topic."""
+        """Send a message to a listener on its topic."""
         self.until(lambda: ["matched", line.split()[0], 1] in self.told)
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
@@ -176,7 +179,7 @@ class Publisher(subprocess.Popen[str]):
 def published(
     number: int, fmu: Path, *options: str, inside: tuple[str, ...] = (), **variables: str
 ) -> Iterator[Publisher]:
-    """``twodof publish`` in a process of its own, when it has told that it is on the network."""
+    """``twodof publish`` in its own process, once it reports that it is on the network."""
     process = Publisher(
         [*inside, *TWODOF, "publish", str(fmu), *options],
         stdout=subprocess.PIPE,
@@ -232,7 +235,7 @@ ISOLATED = ("unshare", "--net", "--mount", "sh", "-c")
 
 
 def isolated(script: str) -> tuple[str, ...]:
-    """A command's beginning that runs it in a network and with mounts of its own, after a script."""
+    """Beginning of a command that runs in its own network and mounts, after a script."""
     needs("networks")
     needs("ip")
     if subprocess.run([*ISOLATED, "ip link"], capture_output=True, check=False).returncode != 0:

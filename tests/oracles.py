@@ -40,8 +40,8 @@ def task_error(e0: np.ndarray, kp: float, kd: float, t: np.ndarray) -> np.ndarra
 class TwoLinkArm:
     """Mass matrix and nonlinear effects of a planar two-link arm in the textbook form.
 
-    Spong, Hutchinson & Vidyasagar, "Robot Modeling and Control", 2nd ed., section 7.3.2, with
-    centres of mass off the links' axes too; masses and inertias are read from the URDF.
+    Source: Spong, Hutchinson & Vidyasagar, "Robot Modeling and Control", 2nd ed., section 7.3.2, extended to centres of
+    mass off the links' axes. Masses and inertias are those of the URDF.
     """
 
     def __init__(self, urdf: Path, gravity: float) -> None:

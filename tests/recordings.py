@@ -40,7 +40,7 @@ def record(bag: Path, fmu: Path, **options: Any) -> Recording:
 
 @pytest.fixture(scope="session")
 def gains(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int, Recording]:
-    """The default arm's run with three gains; that with 50 is the default run."""
+    """The default arm's runs with three gains; that with 50 is the default run."""
 
     def make(folder: Path) -> None:
         for gain, end in ((20, 1.0), (50, 5.0), (400, 1.0)):
@@ -62,7 +62,7 @@ def default(gains: dict[int, Recording]) -> Recording:
 def changing(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Changes before and at the start, between communication points, at one, and too late.
 
-    Each names what changes alone; what it does not name is as it was.
+    Each names only the inputs that change.
     """
     folder = tmp_path_factory.mktemp("changing")
     (folder / "in.csv").write_text(
@@ -106,7 +106,7 @@ def third_party_bag(bag: Path, names: Sequence[str], t: np.ndarray, q: np.ndarra
 
 
 def waves(n: int, count: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times at uneven steps, and n joints that swing about different middles."""
+    """Times at uneven steps, and n joints that oscillate about different centres."""
     t = np.linspace(0.0, 1.0, count) ** 1.5 * 6.0
     phase = np.arange(n)
     q = -0.4 - 0.1 * phase + 0.3 * np.sin(t[:, None] * (1 + 0.2 * phase))
@@ -114,7 +114,7 @@ def waves(n: int, count: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def bare(urdf: str) -> str:
-    """A URDF without its meshes, which the FMU of a test need not carry."""
+    """A URDF without its meshes, which the FMU of a test does not need."""
     tree = ET.fromstring(urdf)
     for link in tree.findall("link"):
         for part in [*link.findall("visual"), *link.findall("collision")]:
@@ -123,7 +123,7 @@ def bare(urdf: str) -> str:
 
 
 def chain_urdf(joints: str, length: float = 0.4, low: float = -2.0, high: float = 2.0) -> str:
-    """A chain; ``joints`` has a letter for each: x, y, z turn about, X, Y, Z slide along."""
+    """A chain with a letter of ``joints`` for each joint: x, y, z rotate about the axis, X, Y, Z slide along it."""
     text = '<robot name="chain"><link name="base"/>'
     for i, letter in enumerate(joints):
         kind = "prismatic" if letter.isupper() else "revolute"
@@ -155,7 +155,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def long_run(default: Recording, q: np.ndarray) -> twodof.Recording:
-    """A run of the default arm at 1 kHz that nothing has simulated."""
+    """An artificial run of the default arm at 1 kHz."""
     run = twodof.read_bag(default.bag)
     stamps = START * 10**9 + np.arange(len(q)) * 10**6
     run.provenance["step"] = 0.001

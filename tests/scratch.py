@@ -11,7 +11,7 @@ import pytest
 
 
 def run_folder() -> Path:
-    """The folder of this run, which the last hook below removes."""
+    """The folder of this run; the last hook below removes it."""
     return Path(os.environ.get("TWODOF_TESTS", tempfile.gettempdir()))
 
 
@@ -31,7 +31,7 @@ class Scratch:
 
     @pytest.hookimpl(wrapper=True, trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> Iterator[None]:
-        """Look once all workers have ended, and before the summary."""
+        """Check the folder after all workers have ended, before the summary."""
         yield
         own = Path(get_temp_dir()).name  # multiprocessing removes it when this process ends
         self.left = sorted({path.name for path in (self.folder / "tmp").iterdir()} - {own})
@@ -48,7 +48,7 @@ class Scratch:
             terminalreporter.write_line(f"Temporary files of this run: {self.folder}")
 
     def pytest_unconfigure(self) -> None:
-        """Keep the folder only where somebody wants to look into it.
+        """Remove the folder, unless files in it failed the run.
 
         multiprocessing looks for its own folder in it at exit, by a finaliser of priority -100.
         """

@@ -7,14 +7,14 @@ from twodof.simulation.sample import Sample, Sink
 
 
 class Collector(list[Sample], Sink):
-    """The sink that keeps what it is given."""
+    """A sink that keeps all samples."""
 
     def write(self, sample: Sample) -> None:
         self.append(sample)
 
 
 class Memory(Sink):
-    """The sink that looks at this process's memory each so many samples."""
+    """A sink that measures this process's memory after each so many samples."""
 
     def __init__(self, every: int) -> None:
         self._every = every
@@ -26,9 +26,9 @@ class Memory(Sink):
 
     @property
     def growth(self) -> int:
-        """By how much it was above that of the first look in both of the last two looks, bytes.
+        """Return the smaller increase, in bytes, of the last two measurements over the first.
 
-        What waits to be stored comes and goes.
+        The memory of waiting messages varies.
         """
         return min(self._looks[-2:]) - self._looks[0]
 

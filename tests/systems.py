@@ -22,7 +22,7 @@ NAMESPACES = " ".join(
 
 
 def pd_fmu(feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: float = 1.0) -> bytes:
-    """Return the FMU of native/pd.c, whose q is in some unit of angle."""
+    """Return the FMU of native/pd.c, with q in a given unit of angle."""
     rows = [
         *(
             (f"{name}[{i + 1}]", 2 * k + i, "input", f'Real start="0.0" unit="{unit if k != 1 else "rad/s"}"')
@@ -113,7 +113,7 @@ WIRES = "".join(
 
 
 def loop(path: Path, plant: bytes, controller: bytes, structure: bytes | None = None, **more: bytes) -> Path:
-    """Write the SSP of a plant and a controller; by default wired, with no connectors of its own."""
+    """Write the SSP of a plant and a controller; by default connected, without connectors of the system."""
     elements = f"<ssd:Elements>{component('plant')}{component('pd')}</ssd:Elements>"
     structure = structure or ssd(f"{elements}<ssd:Connections>{WIRES}</ssd:Connections>")
     files = {"SystemStructure.ssd": structure, "resources/plant.fmu": plant, "resources/pd.fmu": controller}

@@ -19,10 +19,10 @@ if self.Kp[0] % 300 == 0:
 
 
 def table_of(path: Path) -> pandas.DataFrame:
-    """A sweep's table, as it lies in its files, by another reader of Parquet."""
+    """A sweep's table, read from its files by another reader of Parquet."""
     return duckdb.execute(f"select * from '{path}/*.parquet'").df()
 
 
 def same(found: pandas.DataFrame, expected: pandas.DataFrame) -> None:
-    """Compare tables exactly, row by row; a sweep's table is a DataFrame of a class of its own."""
+    """Compare tables exactly, row by row; a sweep's table is a subclass of DataFrame."""
     pandas.testing.assert_frame_equal(found, expected, check_exact=True, check_dtype=False, check_frame_type=False)

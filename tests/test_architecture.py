@@ -70,7 +70,7 @@ MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 78
 
 
 def imported(path: Path) -> set[str]:
-    """Dotted names of what a file imports, also inside functions and for types alone."""
+    """Dotted names of the imports of a file, also inside functions and for types alone."""
     names = set()
     for node in ast.walk(PYTHON[path]):
         if isinstance(node, ast.Import):
@@ -83,7 +83,7 @@ def imported(path: Path) -> set[str]:
 
 
 def room(path: Path) -> str:
-    """A folder or a file of the package; else the folder of the checkout."""
+    """A folder or a file of the package, or else the folder of the checkout."""
     parts = path.with_suffix("").parts
     return parts[1] if parts[0] == "twodof" else parts[0]
 
@@ -169,7 +169,7 @@ def is_property(node: ast.AST) -> bool:
 
 
 def fragments(tree: ast.AST) -> list[str]:
-    """Return first lines of docstrings that are no noun phrase or, of a function, begin with no verb."""
+    """Return first lines of docstrings that are not a noun phrase or, for functions, do not begin with a verb."""
     nodes = (node for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef))
     found = []
     for node in nodes:
@@ -192,7 +192,7 @@ def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase():
 
 
 def test_a_message_of_the_library_names_arguments():
-    """The command line translates them; a page of a sweep shows a command to type, a plugin of pytest has options."""
+    """The command line translates them; exceptions are commands on sweep pages and options of the pytest plugin."""
     option = re.compile(r"(?<!pip install)(?:^|[\s'`(])--[a-z]")
     library = (path for path in PYTHON if "cli" not in path.parts and path.name not in ("maps.py", "plugin.py"))
     found = [
@@ -205,7 +205,7 @@ def test_a_message_of_the_library_names_arguments():
 
 
 def test_one_function_prints():
-    """The one that escapes control and bidirectional characters."""
+    """It escapes control and bidirectional characters."""
     calls = {
         str(path)
         for path, tree in PYTHON.items()

@@ -1,7 +1,7 @@
 """Bags, read by independent readers and compared with independent results.
 
-Readers are rosbags', the MCAP project's own and the standard library's sqlite3; the end effector's
-path is a closed form; type hashes are those that ROS 2 publishes.
+Readers are rosbags', the MCAP project's own and the standard library's sqlite3. The path of the end effector is a
+closed form, and type hashes are those that ROS 2 publishes.
 """
 
 import json
@@ -86,7 +86,7 @@ def recording(native_path, tmp_path_factory):
 @foreign_readers
 @pytest.mark.parametrize("kind", ["plain", "effort"])
 def test_bag_has_every_sample_bit_for_bit(recording, storage, read, kind):
-    """With the effort of the samples where it is asked for."""
+    """It includes efforts if requested."""
     effort = kind == "effort"
     expected = [joint_state(k, s, effort=effort) for k, s in enumerate(recording.samples)]
     assert (len(expected), len(expected[0].effort)) == (501, 16 * effort)
@@ -101,7 +101,7 @@ class Pause(twodof.Sink):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_the_bytes_that_are_reproducible_are_those_of_the_docs(storage, native_path, tmp_path, monkeypatch):
-    """A run that is flushed more often has another storage file, and all else alike."""
+    """More flushes change only the storage file."""
     bags = []
     for name, period in (("seldom", 60.0), ("often", 0.01)):
         monkeypatch.setattr("twodof.bag.store.FLUSH_PERIOD", period)
@@ -136,7 +136,7 @@ def test_start_of_the_stamps_is_exact(native_path, tmp_path):
 
 @pytest.mark.parametrize("start", [-1.0, 2.0**31 - 3, float("nan"), float("inf")])
 def test_stamp_out_of_the_range_of_ros_is_refused(native_path, start):
-    """The last sample's too."""
+    """This includes the last sample's stamp."""
     with pytest.raises(InputError, match="stamp"):
         twodof.experiment(native_path, stop_time=5.0, stamp_start=start)
 
@@ -287,7 +287,7 @@ def test_read_bag_gives_no_effort_where_there_is_none(recording):
 
 
 def write_states(path: Path, states: Sequence[tuple[Sequence[str], Sequence[float]]]) -> Path:
-    """Names and positions of joint states, a second and some from one to the next."""
+    """Write joint states with names and positions, a little more than a second apart."""
     times = [k * SECOND + 5 for k in range(len(states))]
     messages = [joint_message(t, *state, [0.0] * len(state[0])) for t, state in zip(times, states)]
     hello = STORE.types["std_msgs/msg/String"]("hello")
@@ -327,8 +327,10 @@ def test_targets_are_known_where_they_are_in_one_frame(tmp_path, frames, known):
 
 
 def joint_states_of_another_writer(rng: np.random.Generator) -> Iterator[tuple[int, bytes]]:
-    """Make messages of three joints, in frames of any length, with stamps in any order, either byte order, and
-    anything in the gaps that CDR leaves: for these, the bytes that two serialisations differ in."""
+    """Make messages of three joints with frames of any length, stamps in any order and either byte order.
+
+    CDR's padding is random; it is the bytes in which two serialisations differ.
+    """
     for k in rng.permutation(60).tolist():
         frame, names = "x" * (k // 10), ["a", "joint2", "ö"]
         state = joint_message(k * SECOND, names, rng.random(3), rng.random(3), frame=frame)

@@ -77,7 +77,7 @@ def test_a_run_of_another_control_is_not_replayed(native_path, effort, tmp_path,
 
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_commands_of_another_writer(effort, tmp_path, storage):
-    """Held from the first communication point at or after each, as a run on the network has it."""
+    """Each applies from the first communication point at or after it, as on the network."""
     given = {0: (1.0, 0.5), 3: (-2.0, 0.25), 40: (0.5, -0.5)}
     states = [
         ("/joint_states", BEGIN + k * STEP, joint_message(0, ("joint1", "joint2"), (0.0, 0.0))) for k in range(100)
@@ -139,7 +139,7 @@ def test_what_cannot_be_replayed(effort, tmp_path, capfd, messages, topic, reaso
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("last", [np.nan, np.inf])
 def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(tmp_path, capfd, last):
-    """Nor does NumPy say anything of it."""
+    """NumPy gives no warning either."""
 
     def bag(name: str, last: float) -> str:
         return str(
@@ -159,7 +159,7 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(tmp_path, capf
 
 
 def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path, capfd):
-    """Sampled at other times, and one of them for longer."""
+    """They have other sampling times, and different durations."""
 
     def bag(name: str, count: int, step: int, off: float) -> str:
         def q(k: int) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from twodof.errors import BagError
 
 
 def test_an_unfinished_database_in_a_read_only_folder_is_read(native_path, tmp_path, disk):
-    """With the log that its writer has left beside it."""
+    """Its writer's log is next to it."""
     bag, place = tmp_path / "bag", disk(8192)
     twodof.simulate(native_path, twodof.Bag(bag, storage="sqlite3"), stop_time=0.1)
     with closing(sqlite3.connect(bag / "bag.db3", isolation_level=None)) as database:
@@ -50,7 +50,7 @@ def test_messages_are_on_the_disk_before_metadata_says_that_they_are(native_path
 
 
 def test_a_foreign_lock_is_not_waited_for_without_end(native_path, tmp_path, monkeypatch):
-    """A program that locks each folder that appears."""
+    """Another program locks each new folder."""
     monkeypatch.setattr("twodof.files.LOCK_TIMEOUT", 0.1)
     mkdir, held = Path.mkdir, []
 

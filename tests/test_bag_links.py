@@ -1,4 +1,4 @@
-"""Links in an untrusted bag, by which it could read or copy any file of this machine."""
+"""Links in an untrusted bag, which could make a command read or copy any file of this machine."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def bag(request, tmp_path_factory, native_path):
 
 @pytest.fixture
 def linked(bag, tmp_path):
-    """A copy whose writer died, beside a folder of private files."""
+    """A copy of a bag whose writer died, next to a folder of private files."""
     copy = tmp_path / "bag"
     shutil.copytree(bag, copy)
     (copy / "metadata.yaml").unlink()
@@ -34,7 +34,7 @@ def linked(bag, tmp_path):
 
 
 def move_out(file: Path) -> Path:
-    """Put a link in the place of a bag's file, which is then a private one."""
+    """Move a bag's file to the private folder, and replace it by a link."""
     target = file.parent.parent / "private" / file.name
     file.rename(target)
     file.symlink_to(target)
@@ -43,7 +43,7 @@ def move_out(file: Path) -> Path:
 
 @pytest.mark.parametrize("kind", ["link", "chain", "name"])
 def test_a_linked_provenance_is_not_copied(kind, linked):
-    """Its messages are saved without it."""
+    """The messages are saved without it."""
     target = move_out(linked / "run.json")
     content = json.loads(target.read_text())
     target.write_text(json.dumps({**content, "command_line": SECRET}))
@@ -96,7 +96,7 @@ def test_a_bag_that_the_user_names_by_a_link_is_read(linked):
 
 
 def test_linked_metadata_is_not_read(linked):
-    """It says how many messages there are, by which a whole bag is known."""
+    """Its number of messages decides whether a bag is complete."""
     text = "rosbag2_bagfile_information:\n  message_count: 11\n"
     (linked.parent / "private/x").write_text(text)
     (linked / "metadata.yaml").symlink_to(linked.parent / "private/x")
@@ -106,7 +106,7 @@ def test_linked_metadata_is_not_read(linked):
 
 
 def test_meshes_without_end_are_not_copied(linked):
-    """A file of zeros takes no room on the disk, until it is copied."""
+    """A sparse file of zeros takes no space on the disk until it is copied."""
     (linked / "meshes").mkdir()
     with (linked / "meshes/x.stl").open("wb") as file:
         file.truncate(SIZE)

@@ -12,7 +12,7 @@ from twodof.errors import BagError
 
 
 def renamed(bag: Path, name: bytes) -> Path:
-    """The bag in a folder of this name, and itself of this name."""
+    """A bag with this name in a folder of this name."""
     path = Path(os.fsdecode(os.fsencode(bag.parent) + b"/" + name + b"/" + name))
     path.parent.mkdir()
     bag.rename(path)
@@ -42,7 +42,7 @@ def test_bag_of_a_name_that_none_would_find_again_is_refused(run, tmp_path, stor
 
 @pytest.mark.parametrize("verb", ["info", "plot"])
 def test_bag_of_a_name_that_is_not_utf8_is_read(run, tmp_path, verb):
-    """As on a terminal that knows UTF-8 alone."""
+    """The terminal accepts only UTF-8."""
     with twodof.Bag(tmp_path / "bag").begin(run) as sink:
         for k in range(3):
             sink.write(sample(run, k))

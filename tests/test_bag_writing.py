@@ -46,7 +46,7 @@ HERE = Path(__file__).parent
 
 @pytest.mark.parametrize("moment", ["rename", "open", "add_connection"])
 def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(run, tmp_path, moment, monkeypatch):
-    """The second comes just before the first renames the old bag, opens its own, adds a topic."""
+    """The second starts just before the first renames the old bag, opens its own, or adds a topic."""
     path = tmp_path / "bag"
     with twodof.Bag(path).begin(run):
         pass
@@ -103,7 +103,7 @@ with twodof.Bag(path, overwrite=True).begin(run) as bag:
 
 
 def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one(run, tmp_path):
-    """At each change of a folder; between two of them nothing is lost or won."""
+    """It is killed at each change of a folder; between two changes nothing differs."""
     path, left, seen = tmp_path / "bag", dict[str, int](), set[tuple[str, int]]()
     written(run, path, 5)
     keep = shutil.copytree(path, tmp_path / "keep")
@@ -201,7 +201,7 @@ def test_bag_is_locked_though_another_looks_whether_it_is(run, tmp_path, monkeyp
     ids=["empty", "other files", "another run.json", "another metadata.yaml"],
 )
 def test_what_is_no_bag_is_never_overwritten(tmp_path, files):
-    """A folder, or a file."""
+    """It is a folder, or a file."""
     path = tmp_path / "folder"
     path.mkdir()
     for name, text in files.items():
@@ -225,7 +225,7 @@ def test_folder_that_appears_before_the_first_sample_is_kept(run, tmp_path, over
 
 @both_storages
 def test_a_link_stays_and_the_bag_behind_it_is_written(run, tmp_path, storage):
-    """A new one, and one that is replaced."""
+    """The bag is new, or replaces another."""
     link, path = tmp_path / "link", tmp_path / "far" / "bag"
     path.parent.mkdir()
     link.symlink_to("far/bag")
@@ -288,7 +288,7 @@ def test_a_run_that_fails_before_its_first_sample_leaves_no_bag(run, tmp_path, s
 
 
 def fill(bag: twodof.Bag, run: Experiment) -> tuple[str, int]:
-    """Write until the disk is full; what the error says, and how many samples were taken."""
+    """Write until the disk is full; return the error and the number of written samples."""
     taken = 0
     with pytest.raises(BagError) as caught, bag.begin(run):
         for k in range(200_000):
@@ -341,7 +341,7 @@ def test_reserve_is_room_to_close_a_run_that_was_never_flushed(run, disk, monkey
 
 @both_storages
 def test_messages_reach_the_disk_while_the_fmu_takes_its_time(run, tmp_path, storage):
-    """Fewer than fill a buffer, and no more come."""
+    """They are fewer than fill a buffer, and no more arrive."""
     with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         for k in range(50):
             bag.write(sample(run, k))
@@ -393,7 +393,7 @@ def test_memory_does_not_grow_with_the_run(native_path, tmp_path, storage):
 
 @both_storages
 def test_fsync_waits_for_the_disk_at_each_flush(run, tmp_path, storage):
-    """Seen in the system calls of the process."""
+    """It shows in the process's system calls."""
     script = """
 import sys
 import twodof

@@ -1,6 +1,6 @@
-"""The plant without a controller: its accelerations, its stops, its energy.
+"""The plant without a controller: its accelerations, stops and energy.
 
-The oracles are Pinocchio and MuJoCo, each with the robot read from the URDF by itself.
+The oracles are Pinocchio and MuJoCo; each reads the robot from the URDF.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ EVERY_ROBOT = ("twodof", *ROBOTS)
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_bare_plant_is_pinocchios(name, length):
-    """q̈ with efforts, a force at the frame, damping and a payload, both flavours."""
+    """q̈ with efforts, a force at the frame, damping and a payload, in both flavours."""
     native, rng = engine(name, "effort"), np.random.default_rng(1)
     for _ in range(length(1000, 30)):
         plant = random_plant(name, "effort", rng)
@@ -56,8 +56,10 @@ MUJOCO = (
 
 @pytest.mark.parametrize("name", MUJOCO)
 def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
-    """The forces that MuJoCo finds for our q̈, with damping, are those that made it; and where no
-    joint follows another, its q̈ is ours."""
+    """MuJoCo's inverse dynamics of our q̈, with damping, returns the applied efforts.
+
+    Without mimic joints, its q̈ equals ours.
+    """
     monkeypatch.chdir(tmp_path)  # where MuJoCo writes its warnings
     root = ET.parse(urdf_path(name)).getroot()
     for link in root.iter("link"):
@@ -97,7 +99,7 @@ def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
 
 
 def constrained(M, stopped, right):
-    """x of M x − E λ = b, Eᵀ x = 0, where E picks the joints that are stopped."""
+    """Return x of M x − E λ = b, Eᵀ x = 0, where E selects the stopped joints."""
     E = np.eye(len(M))[:, stopped.astype(bool)]
     matrix = np.block([[M, -E], [E.T, np.zeros((E.shape[1],) * 2)]])
     return np.linalg.solve(matrix, right)[: len(M)]
@@ -122,7 +124,7 @@ def conditions(reference, q, v, a_free, W, a, low, high, held):
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_stops_satisfy_their_complementarity_conditions(name):
-    """Several joints at their limits, moving and pressed either way; the impulse too."""
+    """Several joints at their limits move and are pressed in both directions; impulses are included."""
     native, rng = engine(name, "effort"), np.random.default_rng(3)
     several = 0
     for _ in range(50):
@@ -166,7 +168,7 @@ def test_stops_satisfy_their_complementarity_conditions(name):
 @pytest.mark.parametrize("rigid", [False, True])
 @pytest.mark.parametrize("name", ["twodof", "ur5", "panda"])
 def test_stops_are_the_same_in_both_flavours(name, rigid):
-    """With friction, with joints that have no range, and joints that are kept where they are."""
+    """This includes friction, joints without range, and held joints."""
     native, rng = engine(name, "effort"), np.random.default_rng(6)
     for _ in range(50):
         plant = model(name, "effort").plant()
@@ -200,7 +202,7 @@ def test_stops_are_the_same_in_both_flavours(name, rigid):
 
 @pytest.mark.parametrize(("name", "together"), [("twodof", 2), ("ur5", 4), ("panda", 5)])
 def test_joints_pressed_and_released_in_any_order_do_not_depend_on_the_step(name, together):
-    """Efforts that turn at random, in a narrow range; never beyond a limit, whatever the step."""
+    """Efforts reverse at random in a narrow range; no joint passes its limit at any step."""
     native, rng = engine(name, "effort"), np.random.default_rng(0)
     plant = model(name, "effort").plant()
     q = rng.uniform(-1, 1, native.n)

@@ -18,7 +18,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 @pytest.fixture(scope="module")
 def benchmarks():
-    """Their modules: the folder is no package."""
+    """The modules of the benchmarks, whose folder is not a package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(BENCHMARKS)
         names = ("arms", "steps", "engine", "generated", "listing", "mpc", "report")
@@ -65,7 +65,7 @@ def mujoco(benchmarks, tmp_path_factory):
 
 
 def test_mujoco_has_the_same_arm(benchmarks, mujoco):
-    """Free fall from the start: MuJoCo's motion is that of Pinocchio's dynamics."""
+    """In free fall from the start, MuJoCo's motion is that of Pinocchio's dynamics."""
     model = benchmarks.arms.shipped_arm().robot.model.copy()
     model.gravity.linear = np.array(benchmarks.arms.STARTS["gravity"])
     data = model.createData()
@@ -85,7 +85,7 @@ def test_mujoco_has_the_same_controller(benchmarks, mujoco):
 
 
 def test_mujoco_is_measured_without_its_python_package():
-    """It makes the library ask for the time, at more than the cost of a step."""
+    """The package makes the library read the clock, at more than the cost of a step."""
     code = "import sys, engine; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True)
 
@@ -112,7 +112,7 @@ def test_the_engine_is_timed_in_c(benchmarks, tmp_path):
 
 
 def test_a_plan_differs_from_the_fmu_by_runge_kuttas_error(benchmarks, tmp_path):
-    """A method of the fourth order: sixteen steps instead of one divide the error by 16⁴."""
+    """The method has order 4: sixteen steps instead of one divide the error by 16⁴."""
     mpc = benchmarks.mpc
     fmu, sides = mpc.models(tmp_path)
     plans = [mpc.solve(dae, "Gauss-Newton") for dae in sides]

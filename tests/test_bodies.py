@@ -22,7 +22,7 @@ TILTS = (0.0, 1e-12, 1e-7, 1e-3, 0.09, 0.11, 1.0, np.pi / 2, np.pi - 1e-9, np.pi
 
 
 def random_tree(rng):
-    """A URDF of eight joints, two branches, axes and bodies as they fall."""
+    """A URDF of eight joints and two branches, with random axes and bodies."""
     parts = ['<robot name="tree"><link name="l0"/>']
     for i in range(1, 9):
         parent = i - 1 if i != 6 else 3
@@ -92,7 +92,7 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
 
 
 def test_frames_and_bodies_leave_few_constants():
-    """A right angle that a URDF rounds (1.57079632679) does not fill all of them."""
+    """A right angle that a URDF rounds (1.57079632679) leaves zeros zero."""
     constants = joint_tree(model("panda").robot)
     end_body = constants.path[-1]
     for i, body in enumerate(constants.body):

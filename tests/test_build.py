@@ -169,7 +169,7 @@ def test_the_zip_holds_what_tools_and_people_look_for(fmu_path):
 
 
 def test_the_same_inputs_give_the_same_bytes(fmu_path, native_path, tmp_path):
-    """In another process, folder, time zone, locale and hash seed."""
+    """Process, folder, time zone, locale and hash seed differ."""
     code = """import twodof
 twodof.build_fmu("python.fmu")
 twodof.build_fmu("native.fmu", twodof.FmuOptions(native=True))
@@ -193,7 +193,7 @@ def test_an_fmu_that_is_up_to_date_is_left_alone(fmu_path, tmp_path):
 
 
 def test_an_fmu_of_other_settings_is_replaced_on_request_alone(fmu_path, tmp_path):
-    """Whichever name it has, and whoever built it; the default arm's can be built again."""
+    """This holds for any name and builder; only the default arm's FMU is built again."""
     path = tmp_path / "A.fmu"
     path.write_bytes(fmu_path.read_bytes())
     other = build_fmu(path, FmuOptions(control="effort")).read_bytes()
@@ -385,7 +385,7 @@ NEEDS_A_PERIOD = ("control_delay", "q_resolution", "q_noise", "v_noise", "v_from
 
 
 def declared(description, element):
-    """Names of the variables that each unknown depends on, by its name."""
+    """Names of the variables on which each unknown depends, by its name."""
     names = [v.get("name") for v in description.find("ModelVariables")]
     return {
         names[int(unknown.get("index")) - 1]: {names[int(i) - 1] for i in unknown.get("dependencies").split()}
@@ -417,7 +417,7 @@ def put(driver, name, value):
 
 @in_child_process
 def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
-    """Amid its range and at limits, moving to and fro, saturated and not."""
+    """Joints are inside their ranges and at limits, move in both directions, and are saturated or not."""
     with zipfile.ZipFile(fmu_path) as archive:
         description = etree.fromstring(archive.read("modelDescription.xml"))
     causes: dict = {name: set() for name in declared(description, "InitialUnknowns")}
@@ -470,7 +470,7 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
 
 
 def candidates(name, start):
-    """Other values of a variable that the plant accepts."""
+    """Other valid values of a variable."""
     group, _, index = name.partition("[")
     value = start[name]
     if group in NEEDS_A_PERIOD and not start["control_period"]:

@@ -105,7 +105,7 @@ def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
-    """A crash leaves the other rows."""
+    """A crash affects no other row."""
     row, text = FAULTS[fault]
     described = (
         DESCRIPTION.replace("</ModelVariables>", COUNT).replace(*ALSO_INDEX) if fault == "COUNTS" else DESCRIPTION
@@ -125,7 +125,7 @@ def test_another_start_value_than_the_stated_one_fails(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part", ["all", "controller"])
 def test_a_sampled_controller_passes(part: Any, tmp_path: Path) -> None:
-    """At a sampling instant its effort follows the target, and between two samples it does not."""
+    """Its effort depends on the target at a sampling instant, and not between two samples."""
     options = twodof.FmuOptions(native=True, part=part, settings={"control_period": 0.01})
     check = twodof.check(twodof.build_fmu(tmp_path / "arm.fmu", options))
     assert not failed(check), str(check)
@@ -170,7 +170,7 @@ def test_what_the_description_does_not_claim_does_not_apply(tmp_path: Path) -> N
 
 
 def test_a_description_with_problems_fails(tmp_path: Path) -> None:
-    """The FMU runs all the same, where its schema holds."""
+    """The FMU runs all the same if its schema is valid."""
     described = DESCRIPTION.replace('<Real derivative="2"/>', '<Real derivative="2" unit="furlong"/>')
     check = twodof.check(foreign(tmp_path, description=described))
     assert failed(check) == {"description": 'The unit "furlong" of variable "der(x)" (line 9) is not defined.'}
@@ -193,7 +193,7 @@ NAMES = """a _a1 1a a.b a[1] a[1,2].b_2[3] a[] a. der(x) der(x[1]) der(x,2) der(
 
 @pytest.mark.parametrize("kind", ["flat", "structured"])
 def test_names_are_those_that_fmpy_allows(kind: str) -> None:
-    """FMPy's parser of names takes a minute for the 20,000 that come after."""
+    """FMPy's parser of names would take a minute for the 20,000 names that follow."""
     names = [*NAMES.split(), "a\tb"]
     variables = "".join(f"<Real name={quoteattr(name)}/>" for name in names)
     root = ET.fromstring(f'<fmi variableNamingConvention="{kind}"><ModelVariables>{variables}</ModelVariables></fmi>')
@@ -242,7 +242,7 @@ def test_the_command_prints_a_table_or_json(
 
 
 def test_each_fmu_of_a_system_is_checked(tmp_path: Path) -> None:
-    """A plant of this project and a controller of another maker, which reads with no state of its own."""
+    """They are a plant of this project and a third-party controller without states."""
     plant = twodof.build_fmu(tmp_path / "plant.fmu", twodof.FmuOptions(native=True, control="effort"))
     path = loop(tmp_path / "loop.ssp", plant.read_bytes(), pd_fmu())
     check = twodof.check(path)

@@ -25,7 +25,7 @@ RUN = ["run", "arm.fmu", "-o", "out", "--stop-time", "0.02"]
 
 
 def twodof_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
+    """The command in its own process."""
     return python("-m", "twodof", *arguments, cwd=cwd, env=ENVIRONMENT)
 
 
@@ -94,7 +94,7 @@ def test_run_says_how_fast_it_was_and_what_to_do_next(session):
 @pytest.mark.parametrize("activated", [True, False])
 @pytest.mark.parametrize("missing", [[], ["matplotlib", "websockets"]])
 def test_what_is_suggested_can_be_typed(activated, missing, native_path, tmp_path):
-    """In a shell that finds the program or does not, with and without figures and pages."""
+    """The shell finds the program or not; the extras for figures and pages are installed or not."""
     here = str(Path(sys.executable).parent)
     path = [p for p in os.environ["PATH"].split(os.pathsep) if Path(p) != Path(here)]
     spec = f"import importlib.util as u; f = u.find_spec; absent = {missing!r}; "
@@ -174,7 +174,7 @@ def test_overwrite_replaces_a_bag(storage, folder, capfd):
 
 
 def test_bag_without_a_name_is_named_after_the_date(folder, capfd, monkeypatch):
-    """And a second one of the same second has a name of its own."""
+    """A second one in the same second has another name."""
     run = ["run", "arm.fmu", "--stop-time", "0.01"]
     assert main(run) == 0
     (bag,) = (path for path in folder.iterdir() if path.is_dir())
@@ -245,7 +245,7 @@ def test_a_closed_output_is_no_error(folder):
 
 
 def redirected(arguments: str, redirect: str, folder: Path, unbuffered: str = "") -> tuple[int, str]:
-    """Exit status and errors of a command whose output goes elsewhere."""
+    """Exit status and errors of a command with redirected output."""
     done = subprocess.run(
         ["sh", "-c", f'"$0" "$@" {redirect}', *COMMAND, *arguments.split()],
         cwd=folder,
@@ -337,7 +337,7 @@ def test_the_examples_of_each_help_are_commands(verb):
 
 
 def test_a_compiler_that_works_is_seen_working(tmp_path):
-    """A line within a second, seconds on a terminal, and at the end a line that is clear."""
+    """A line appears within a second, counts seconds on a terminal, and is cleared at the end."""
     code = "import time; from twodof.cli.printing import busy\nwith busy('compiling'): time.sleep(1.7)"
     done = python("-c", code, env=ENVIRONMENT, check=True)
     assert done.stderr == "compiling …\n"
@@ -349,7 +349,7 @@ def test_a_compiler_that_works_is_seen_working(tmp_path):
 
 
 def test_help_texts_are_phrases_that_stand_alone():
-    """A default or a unit by itself tells nothing about an option."""
+    """A default or a unit alone explains no option."""
     for verb, its_parser in parser()[1].items():
         for action in its_parser._actions:
             assert action.help, f"{verb} {action.dest}"

@@ -56,7 +56,7 @@ def exact(times: list[float], Kp: float, Kd: float) -> Iterator[tuple[float, ...
 
 @pytest.mark.parametrize("gains", GAINS.values(), ids=list(GAINS))
 def test_responses_are_exact_to_rounding(gains: tuple[float, float]) -> None:
-    """Near critical damping, without gains and where the series takes over, too."""
+    """This includes critical damping, gains of 0, and the transition to the series."""
     Kp, Kd = gains
     stages = np.array([1e-6, 0.1, 0.49, 0.51, 3.0, 15.0], np.float32)
     times = np.float64(stages / np.float32(max(abs(Kd), abs(Kp) ** 0.5) or 1.0))  # short fractions
@@ -95,7 +95,7 @@ def test_small_errors_keep_their_digits() -> None:
 
 @pytest.mark.parametrize("Kp", [1e-9, 1e-3, 1.0])
 def test_a_soft_spring_pulls_for_as_long_as_it_takes(Kp: float) -> None:
-    """Its root is Kp/Kd to first order, a difference of numbers that are almost equal."""
+    """Its root is Kp/Kd to first order, a difference of almost equal numbers."""
     Kd = 4e4
     t = np.array([Kd / Kp])
     phi = float(responses(t, Kp, Kd).phi[0])
@@ -124,7 +124,7 @@ SCHEDULE = [
 
 
 def test_inputs_that_change_give_what_an_integrator_gives() -> None:
-    """Targets, velocities, accelerations and gains, of which some are zero, change on the way."""
+    """Targets, velocities, accelerations and gains change during the motion; some are zero."""
     step, steps = 0.01, 300
     x, v = np.array([0.23, 0.18]), np.array([0.4, -0.2])
     error = task_error(tuple(x), tuple(v), SCHEDULE, step, np.arange(steps + 1))
@@ -152,7 +152,7 @@ def test_at_a_change_the_error_is_still_that_from_the_target_before() -> None:
 
 
 def test_some_samples_have_the_error_that_they_have_among_all() -> None:
-    """As of a bag that was recovered, or thinned out; also where none is between two changes."""
+    """The bag is recovered or downsampled; some intervals between changes have no sample."""
     steps = np.array([0, 1, 2, 69, 70, 72, 150, 151, 299])
     some, every = (task_error((0.23, 0.18), (0.4, -0.2), SCHEDULE, 0.01, k) for k in (steps, np.arange(300)))
     np.testing.assert_allclose(some, every[steps], rtol=0.0, atol=1e-15)

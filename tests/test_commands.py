@@ -18,7 +18,7 @@ Build = Callable[..., twodof.Fmu]
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    """The default arm under a control, described and not compiled."""
+    """The description of the default arm under a control, not compiled."""
 
     def build(control: str) -> twodof.Fmu:
         path = tmp_path_factory.mktemp(control) / "Arm.fmu"

@@ -28,7 +28,7 @@ def test_compiler_errors():
 
 
 def test_equal_sources_give_equal_libraries():
-    """In another folder too, where the compiler does not know them from before."""
+    """In another folder, the compiler has no cached result."""
     sources = model("twodof").sources()
     first = compile_library(sources, "linux64", "Arm")
     assert compile_library({**sources, "elsewhere.h": b""}, "linux64", "Arm") == first
@@ -37,7 +37,7 @@ def test_equal_sources_give_equal_libraries():
 
 @pytest.fixture
 def kept(tmp_path, monkeypatch):
-    """Folder of what is kept, empty; zig has its C library."""
+    """The cache folder, empty except for the C library of zig."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
     cache = tmp_path / "cache"
     cache.mkdir()
@@ -85,7 +85,7 @@ def given_away(path):
 @pytest.mark.parametrize("change", [given_away, lambda path: path.chmod(0o777)])
 @pytest.mark.parametrize("part", ["the cache", "its folder", "the file"])
 def test_a_library_that_others_may_have_written_is_not_taken(kept, caplog, change, part):
-    """Their code would run in the next FMU, whether it is in the library or in zig's C library."""
+    """Otherwise their code would run in the next FMU, from the library or from zig's C library."""
     first = answer(1)
     (file,) = kept.iterdir()
     file.write_bytes(hashlib.sha256(b"evil").digest() + b"evil")

@@ -1,4 +1,4 @@
-"""A confined child process can use the files that it was given, and nothing else of the system."""
+"""A confined child process can use the given files, and nothing else of the system."""
 
 import ctypes
 import errno
@@ -19,7 +19,7 @@ MEMORY, SECONDS = 1024**3, 20
 
 
 def attempt(pipe: Connection, folder: Path, name: str) -> None:
-    """In the child: do it, confined; send the number of the error, or what it gives."""
+    """Try a function in the confined child; send the error number or the result."""
     confine(MEMORY, SECONDS, [folder])
     try:
         pipe.send(ATTEMPTS[name](folder))
@@ -34,7 +34,7 @@ def create(folder: Path) -> object:
 
 
 def raw_call(number: int, *arguments: int) -> object:
-    """A system call as injected code would do it, past the C library's functions."""
+    """Make a system call as injected code would, without the C library's functions."""
     libc = ctypes.CDLL(None, use_errno=True)
     status = libc.syscall(number, *arguments)
     if status < 0:

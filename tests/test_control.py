@@ -120,7 +120,7 @@ def test_unknown_payload_against_an_independent_integration(fmus, control, nativ
 
 @pytest.mark.parametrize("native", [False, True])
 def test_energy_of_the_free_plant_is_kept(fmus, native):
-    """No effort, no damping, no stop: kinetic and potential energy, by Pinocchio."""
+    """Without effort, damping and stops; kinetic and potential energy are by Pinocchio."""
     settings = {"q_max": 1e3, "q_min": -1e3, "rtol": 1e-12, "atol": 1e-13, "max_step": 0.1}
     _, q, v = trajectory(fmus["effort", native], stop_time=10, settings=settings)
     plant = model("twodof").plant()
@@ -139,7 +139,7 @@ def test_energy_of_the_free_plant_is_kept(fmus, native):
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
-    """Stopped and released at several limits, by an input that turns."""
+    """An alternating input stops and releases joints at several limits."""
     settings = {"q_min": (0.2, 0.1), "q_max": (0.7, 0.5), "rigid_stops": True, **TIGHT}
     table = {
         "task": ("x_des", [(0.1, 0.25), (0.28, 0.05), (0.2, 0.15)]),
@@ -176,7 +176,7 @@ def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_flavours_are_equal_with_limits_of_all_kinds_and_a_force(fmus, control):
-    """Joints stopped, efforts saturated, pushed, with an unknown payload; stops as by default."""
+    """Joints are stopped, efforts saturated, with an external force and an unknown payload."""
     settings = {
         "q_min": (0.2, 0.1),
         "q_max": (0.7, 0.5),
@@ -204,7 +204,7 @@ def test_flavours_are_equal_with_limits_of_all_kinds_and_a_force(fmus, control):
 
 
 def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
-    """Joint 2 is thrown off its stop for 11 µs, at 0.9481 s."""
+    """Joint 2 leaves its stop for 11 µs, at 0.9481 s."""
     rng = np.random.default_rng(1)
     torque, limit = rng.uniform(0.2, 2.0), 0.3 * rng.uniform(0.2, 2.0)
     changes = [(0.2 * k, dict(zip(("tau_cmd[1]", "tau_cmd[2]"), rng.uniform(-torque, torque, 2)))) for k in range(5)]
@@ -217,7 +217,7 @@ def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
 
 
 def test_two_stops_that_drive_off_each_other_come_to_rest():
-    """As the feet of a rocking block; impacts in turn would never end."""
+    """They act like the feet of a rocking block; impacts in turn would never end."""
     of = engine("twodof", "effort")
     plant = of.model.plant()
     plant.q_max, plant.q_min, plant.tau_cmd = [0.6, 0.36], [0.4, 0.34], [0.5, -0.1]
@@ -330,7 +330,7 @@ def test_a_variable_of_another_control_is_named_as_such(fmus):
 
 @pytest.mark.parametrize("rigid", [False, True])
 def test_a_start_into_a_stop_is_an_impact(fmus, rigid):
-    """Rigid: the plastic impulse, with M by Pinocchio; else that joint's velocity alone."""
+    """With rigid stops it is the plastic impulse, with Pinocchio's M; otherwise only that joint's velocity changes."""
     plant = model("twodof").plant()
     q, v = np.array([0.5, 0.35]), np.array([3.0, -9.0])
     M = pin.crba(plant.robot.model, plant.robot.model.createData(), q)
@@ -345,7 +345,7 @@ def test_a_start_into_a_stop_is_an_impact(fmus, rigid):
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_target_on_a_limit_does_not_chatter(fmus, side):
-    """The joint that is not pressed is driven off by the other's stop."""
+    """The other joint's stop pushes the unpressed joint off its limit."""
     settings = {"q_min": -1.0, "q_max": 1.0, "q_start": (side, -side), "q_des": (4 * side, -side)}
     _, q, _ = trajectory(fmus["joint", True], settings={**settings, **TIGHT}, stop_time=0.3)
     assert (q[:, 0] == side).all() and side * q[-1, 1] > 0.5
@@ -367,7 +367,7 @@ def test_a_payload_that_is_none_is_refused(fmus, payload):
 
 @pytest.mark.parametrize("control", ["pose", "effort"])
 def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, capsys):
-    """Bag, figure, replay, sweep and what a page offers, with an FMU of each control."""
+    """Bag, figure, replay, sweep and page, with an FMU of each control."""
 
     from twodof.cli.main import main
     from twodof.pages.arm import RECORDED

@@ -1,4 +1,4 @@
-"""The controller as an FMU of its own, in a loop with the bare plant, against the FMU of both."""
+"""The controller as a separate FMU, in closed loop with the bare plant, compared with the FMU of both."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STOP = 1.0
 
 @pytest.fixture(scope="module")
 def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A plant, and of each law the controller, the FMU of both, and the system of plant and controller."""
+    """A plant and, for each law, the controller, the FMU of both, and the system of plant and controller."""
     folder, built = tmp_path_factory.mktemp("parts"), {}
 
     def build(name: str, **options: Any) -> Path:
@@ -91,7 +91,7 @@ def test_a_sampled_split_loop_is_the_whole(fmus: dict[str, Path], law: str, peri
 
 
 def test_the_controller_knows_what_it_is_told(fmus: dict[str, Path]) -> None:
-    """A payload of the plant is one that the controller knows, or not."""
+    """The plant's payload is known to the controller, or not."""
     for known in (False, True):
         loads = {"payload": 0.2, "payload_known": known}
         whole = q_of(fmus["joint both"], **TARGETS["joint"], **loads, control_period=0.01)
@@ -117,7 +117,7 @@ def test_its_description_is_that_of_a_law(tmp_path: Path, fmi: int) -> None:
     ("key", "inside"), [("plant", [False, True]), ("task law", [True, False]), ("task both", [True] * 2)]
 )
 def test_its_documentation_draws_the_loop(fmus: dict[str, Path], key: str, inside: list[bool]) -> None:
-    """Controller and plant, of which the one that is not in the FMU is dashed."""
+    """The part of the loop that is not in the FMU is dashed."""
     with zipfile.ZipFile(fmus[key]) as archive:
         drawn = re.findall("<svg.*</svg>", archive.read("documentation/index.html").decode(), re.DOTALL)
     blocks = ET.fromstring(drawn[0]).iter("rect")
@@ -125,7 +125,7 @@ def test_its_documentation_draws_the_loop(fmus: dict[str, Path], key: str, insid
 
 
 def test_its_effort_is_that_of_the_whole_at_once(fmus: dict[str, Path]) -> None:
-    """In co-simulation before any step, and in Model Exchange, whatever the state."""
+    """In co-simulation before any step, and in Model Exchange at any state."""
     whole = next(twodof.samples(fmus["joint both"], settings={"q_start": (0.3, -0.4), **TARGETS["joint"]}))
     starts = {"q[1]": 0.3, "q[2]": -0.4, "q_des[1]": 0.1, "q_des[2]": 0.9}
     for kind in ("CoSimulation", "ModelExchange"):
@@ -217,7 +217,7 @@ def ssp(tmp_path_factory: pytest.TempPathFactory, fmi: int) -> Path:
 
 
 def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None:
-    """Each start value goes to the FMU that has it; names are those of the whole."""
+    """Each start value goes to its FMU; names are those of the FMU of both."""
     system = twodof.load_fmu(ssp)
     assert isinstance(system, System)
     assert [fmu.version for fmu in system.components.values()] == [fmi, fmi]
@@ -251,7 +251,7 @@ def test_a_split_robot_is_built_again_byte_by_byte(ssp: Path, fmi: int, tmp_path
 
 
 def delayed(path: Path, h: float = 0.01, *, at_start: bool = True) -> list[float]:
-    """Return q at STOP of a system whose FMUs receive at each instant the outputs of before it, in any order.
+    """Return q at STOP of a system whose FMUs receive at each instant the previous outputs, in any order.
 
     At the start, the outputs are those of the start values, or 0.
     """
@@ -272,7 +272,7 @@ def delayed(path: Path, h: float = 0.01, *, at_start: bool = True) -> list[float
 
 
 def test_fmpy_runs_a_split_robot(tmp_path: Path) -> None:
-    """FMPy passes outputs on a step later, which loses as much as is of order 1."""
+    """FMPy delays connections by one step, which is an error of first order."""
     path = twodof.build_fmu(tmp_path / "arm.ssp", twodof.FmuOptions(part="split"))
     errors = []
     for h in (0.01, 0.005):
@@ -291,7 +291,7 @@ def test_libcosim_runs_a_split_robot(tmp_path: Path) -> None:
 
 @in_child_process
 def in_libcosim(tmp_path: Path) -> None:
-    """It, too, passes outputs on a step later."""
+    """libcosim also delays connections by one step."""
     from libcosimpy.CosimExecution import CosimExecution
     from libcosimpy.CosimObserver import CosimObserver
 

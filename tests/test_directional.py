@@ -14,7 +14,7 @@ from twodof.plant.stops import CLAMPED, FREE, STOPPED, STUCK
 
 
 class Derivatives(Engine):
-    """An engine with the function that gives derivatives."""
+    """An engine with the function for derivatives."""
 
     def __init__(self, of, flags=()):
         super().__init__(of, flags)
@@ -24,7 +24,7 @@ class Derivatives(Engine):
         self.known = [i for i in range(self.count) if i < of.index("x")]
 
     def jacobian(self, values, held=None, slip=None):
-        """∂ computed/∂ known, a row each of the variables from q on up to the parameters."""
+        """∂ computed/∂ known, one row per variable from q to the parameters."""
         held, slip = (np.zeros(self.n, dtype=np.int32) if x is None else x for x in (held, slip))
         columns = []
         for k in self.known:
@@ -69,7 +69,7 @@ class Derivatives(Engine):
 
 
 def at_random(engine, rng, **settings):
-    """Values of all variables, amid the joints' ranges."""
+    """Random values of all variables, inside the joints' ranges."""
     of = engine.model
     plant = of.plant()
     low, high = np.maximum(plant.q_min, -2.0), np.minimum(plant.q_max, 2.0)
@@ -85,10 +85,10 @@ def at_random(engine, rng, **settings):
 
 
 def derivatives(reduced: Reduced, q, v, effort):
-    """Return the derivatives of q̈ by q, v and τ.
+    """Return the derivatives of q̈ with respect to q, v and τ.
 
-    They are Pinocchio's of the forward dynamics, or where joints follow others those of the inverse dynamics, in the
-    coordinates of the joints that move on their own.
+    They are Pinocchio's of the forward dynamics or, with mimic joints, those of the inverse dynamics in the coordinates
+    of the independent joints.
     """
     model, data, G = reduced.model, reduced.data, reduced.G
     if model.nv == len(q):
@@ -123,7 +123,7 @@ def test_the_bare_plants_are_pinocchios(name):
 
 
 def test_task_control_at_rest_has_the_poles_of_its_gains():
-    """s² + Kd s + Kp, on both axes of the default arm and three of the UR5 with six joints."""
+    """The polynomial is s² + Kd s + Kp, on both axes of the default arm and three of the UR5."""
     for name, extra in (("twodof", 0), ("ur5", 3)):
         engine = Derivatives(model(name))
         plant = engine.model.plant()
@@ -204,7 +204,7 @@ def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
 
 @pytest.mark.parametrize(("control", "period"), [("effort", 0.0), ("joint", 0.0), ("joint", 0.01)])
 def test_joints_that_stick_and_slip_have_pinocchios_derivatives(control, period):
-    """From M q̈ + h = τ + λ, in the rows of joints that move: M_mm δq̈ = δτ − ∂(M q̈ + h), q̈ being that of the motion."""
+    """M q̈ + h = τ + λ gives, in the rows of moving joints, M_mm δq̈ = δτ − ∂(M q̈ + h) at constant q̈."""
     engine = Derivatives(model("ur5", control))
     robot, rng = engine.model.robot, np.random.default_rng(6)
     reference, n = robot.model.copy(), engine.n

@@ -1,9 +1,8 @@
 """The commands and programs of the documentation run, and its links exist.
 
-A page is run as one shell script, from top to bottom, in a folder that holds nothing but an
-environment ``.venv``, which is this one. What is run are blocks fenced as ``sh`` and ``python``;
-what needs ROS 2, a display, a network or minutes is fenced as ``console``, output as ``text``.
-All that is not run is left blank in the script, so that its line numbers are those of the page.
+A page runs as one shell script, from top to bottom, in a folder that contains only ``.venv``, this environment. Blocks
+fenced as ``sh`` and ``python`` run. ``console`` marks commands that need ROS 2, a display, a network or minutes, and
+``text`` marks output. The script has blank lines for all other lines, so that its line numbers are those of the page.
 """
 
 import os
@@ -70,7 +69,7 @@ def script(text: str, name: str, folder: Path) -> str:
 
 
 def run_page(text: str, name: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """A page run in an environment in which nothing is activated."""
+    """Run a page in an environment that is not activated."""
     work, home, programs = (folder / part for part in ("work", "home", "programs"))
     for part in (work, home, programs):
         part.mkdir()
@@ -143,7 +142,7 @@ def test_every_block_is_of_a_known_kind(page):
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of a page's headings, as forges and mkdocs make them."""
+    """The anchors of a page's headings, as GitHub and mkdocs make them."""
     headings = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}
 

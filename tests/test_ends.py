@@ -25,7 +25,7 @@ ENDLESS = ["--stop-time", "1e5", "--stamp-start", str(START)]
 
 
 def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
-    """A run that has written its first sample."""
+    """Start a run, and wait for its first sample."""
     command = [*TWODOF, "run", str(fmu), "-o", str(bag), *ENDLESS, *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not has_samples(bag):
@@ -36,7 +36,7 @@ def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
 
 
 def has_samples(bag: Path) -> bool:
-    """Return True if the first sample of a run is in its bag, which then has its reserve."""
+    """Return True if the bag has its first sample, and thus its reserve."""
     try:
         return (bag / "reserve").exists() and any(any(read_messages(file, ReadBudget())) for file in storage_files(bag))
     except (OSError, DamageError):
@@ -44,7 +44,7 @@ def has_samples(bag: Path) -> bool:
 
 
 def whole(fmu: Path, folder: Path, n: int) -> Sequence[object]:
-    """The first n messages of a run that nothing disturbs."""
+    """The first n messages of an undisturbed run."""
     stop = str(n * 0.01)
     options = ["--stop-time", stop, "--stamp-start", str(START), "-o", str(folder / "whole")]
     assert main(["run", str(fmu), *options]) == 0
@@ -125,7 +125,7 @@ except KeyboardInterrupt:
 
 @both_storages
 def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(native_path, tmp_path, storage):
-    """Python raises KeyboardInterrupt anywhere, in the middle of a write too."""
+    """Python raises KeyboardInterrupt at any instruction, also during a write."""
     for i in range(3):
         bag = tmp_path / f"bag{i}"
         process = subprocess.Popen(
@@ -168,7 +168,7 @@ def test_folder_that_goes_under_the_run_ends_it(native_path, tmp_path, storage, 
 @pytest.mark.long
 @both_storages
 def test_full_disk_costs_a_second_at_most(native_path, tmp_path, disk, storage, length):
-    """Somebody else fills the disk to the last byte under a run in real time."""
+    """Another process fills the disk to the last byte during a run in real time."""
     expected = whole(native_path, tmp_path, 1000)
     rng = random.Random(storage)
     lost = []
@@ -203,7 +203,7 @@ def test_reader_of_the_summary_that_leaves_costs_no_sample(native_path, tmp_path
 
 
 def test_interrupt_while_a_file_is_closed_is_an_interrupt(monkeypatch, capsys):
-    """As in ``shutil.rmtree``, which closes a folder once more if it does not know that it has."""
+    """``shutil.rmtree`` then closes the folder a second time."""
 
     def verb(_options: object) -> int:
         descriptor = os.open(os.devnull, os.O_RDONLY)

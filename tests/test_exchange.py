@@ -26,7 +26,7 @@ NARROW = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0}
 
 
 class Fmus(dict):
-    """The default arm under each control, and other robots; each is built where it is asked for."""
+    """The default arm under each control, and other robots, each built on demand."""
 
     def __init__(self, folder):
         self._folder = folder
@@ -54,7 +54,7 @@ def states(fmu):
 
 
 def run(fmu, kind, starts, stop_time=2.0, interval=0.01, **named):
-    """States at each interval, as an array with a column each."""
+    """States at each interval, one column per state."""
     result = fmpy.simulate_fmu(
         str(fmu),
         fmi_type=kind,
@@ -115,7 +115,7 @@ class FMU2Exchange(Recorded, FMU2Model):
         return list(z)
 
     def event(self):
-        """An event, wanted or not; whether the state changed."""
+        """Do an event, requested or not; return whether the state changed."""
         self.enterEventMode()
         return self.go()
 
@@ -238,7 +238,7 @@ def test_a_joint_that_rests_at_its_stop_for_ten_seconds_has_one_event(fmus, monk
 
 @pytest.fixture
 def falling(fmus):
-    """The bare arm without gravity, its first joint on its way to a limit at 1 rad/s."""
+    """The bare arm without gravity, whose first joint moves to a limit at 1 rad/s."""
     model = Model(
         fmus["effort"],
         gravity=[0.0, 0.0, 0.0],
@@ -313,7 +313,7 @@ def test_a_solvers_rounding_does_not_let_a_held_joint_go(fmus):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_sticking_and_slipping_have_few_events(fmus, events, seed):
-    """At most three for each change, of which the steps of 1 ms of co-simulation see some."""
+    """There are at most three for each change, some of which the steps of 1 ms of co-simulation show."""
     rng = np.random.default_rng(seed)
     starts = {f"{group}[{i}]": rng.uniform(low, high) for i in (1, 2) for group, (low, high) in RUBBING.items()}
     ours = run(fmus["joint"], "CoSimulation", starts, 2.0, 1e-3)
@@ -326,7 +326,7 @@ def test_sticking_and_slipping_have_few_events(fmus, events, seed):
 
 @pytest.fixture
 def events(monkeypatch):
-    """One element an event of a model that FMPy simulates; 1,000 are without end."""
+    """A list with one element per event of a model that FMPy simulates; more than 1,000 fail."""
     entered, enter = [], FMU2Model.enterEventMode
 
     def counted(model):
@@ -339,8 +339,10 @@ def events(monkeypatch):
 
 
 def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, events):
-    """As the feet of a rocking block. Were each impact to free the other joint, there would be no
-    end of events."""
+    """They act like the feet of a rocking block.
+
+    If each impact released the other joint, events would never end.
+    """
     starts = {
         "q_min[1]": 0.0,
         "q_max[2]": 0.5,
@@ -356,7 +358,7 @@ def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, events):
 
 @pytest.mark.parametrize("torques", [(0.0236, 0.9009), (0.8861, 0.0227), (0.2502, 0.7944)])
 def test_a_joint_that_is_thrown_off_its_stop_has_no_event_by_a_solvers_error(fmus, events, torques):
-    """CVode's own tolerance is far beyond what is past a limit."""
+    """CVode's own tolerance is much larger than the tolerated depth behind a limit."""
     starts = {
         f"{group}[{i}]": value for i in (1, 2) for group, value in (("q_start", 0.0), ("q_min", -0.3), ("q_max", 0.3))
     }
@@ -370,7 +372,7 @@ def test_a_joint_that_is_thrown_off_its_stop_has_no_event_by_a_solvers_error(fmu
 
 
 def test_events_are_at_the_times_of_the_closed_form(fmus, monkeypatch):
-    """q = q_des (1 − cos ωt) under joint control without Kd is at 1 where cos ωt = 1 − 1/q_des."""
+    """q = q_des (1 − cos ωt) under joint control without Kd reaches 1 where cos ωt = 1 − 1/q_des."""
     time, events = [0.0], []
     enter, set_time = FMU2Model.enterEventMode, FMU2Model.setTime
 
@@ -404,7 +406,7 @@ def test_events_are_at_the_times_of_the_closed_form(fmus, monkeypatch):
 
 
 def test_the_jump_of_the_pseudo_inverse_is_an_event(fmus):
-    """The stretched arm's J has the ratio of singular values rcond there, and nowhere else near."""
+    """Near the start, only the stretched arm has the ratio rcond of singular values."""
     model = Model(fmus["task"], rcond=0.05)
     model.go()
     signs = []
@@ -422,7 +424,7 @@ def test_the_jump_of_the_pseudo_inverse_is_an_event(fmus):
 
 
 def test_states_by_real_variables_and_derivatives_by_real_variables(fmus):
-    """As CasADi does; in event mode too."""
+    """CasADi uses them, also in event mode."""
     model, other = Model(fmus["task"]), Model(fmus["task"])
     other.go()
     y = [0.3, 0.9, -0.4, 0.2]
@@ -453,7 +455,7 @@ def test_sensors_need_a_period_as_there_are_no_communication_points(fmus):
 
 
 def test_a_time_event_is_announced_until_it_is_past(fmus):
-    """Samples at 0, 0.01, …, efforts 4 ms later; what acts changes at an event alone."""
+    """Samples are at 0, 0.01, …, efforts act 4 ms later; the acting effort changes only at events."""
     model = Model(fmus["joint"], control_period=0.01, control_delay=0.004, q_des=(0.6, 0.5))
 
     def next_event():
@@ -545,7 +547,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_change_of_anything_gives_another_jacobian(fmus, change):
-    """The columns are those of another instance that is asked for one direction at a point."""
+    """Its columns equal those of an instance that computes one direction at each point."""
     starts: dict[str, Any] = {
         "friction": [0.3, 0.0],
         "q_max": [3.0, 2.0],

@@ -26,7 +26,7 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> tuple[twodof.Excitation,
 
 
 def test_a_motion_is_smooth_and_within_the_limits(tmp_path):
-    """With MuJoCo's efforts. Limits are so narrow that each of them matters."""
+    """Efforts are MuJoCo's. The limits are so narrow that each of them is active."""
     text = ARM.read_text("utf-8")
     for low, high, effort, speed in ((-0.2, 1.0, 0.5, 1.5), (0.1, 0.9, 0.004, 20.0)):
         limit = f'lower="{low}" upper="{high}" effort="{effort}" velocity="{speed}"'

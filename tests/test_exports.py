@@ -68,7 +68,7 @@ def test_one_mcap_file_has_all_messages(storage, native_path, tmp_path):
 
 
 def test_a_lerobot_dataset_has_an_episode_for_each_bag(bag_path, native_path, tmp_path):
-    """In the columns and facts that LeRobot 0.4.4 itself writes and reads; an action applies from its sample on."""
+    """Columns and metadata are those of LeRobot 0.4.4; an action applies from its sample on."""
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.2)
     path = tmp_path / "arm.lerobot"
     assert main(["export", str(bag_path), str(tmp_path / "bag"), "-o", str(path)]) == 0
@@ -144,7 +144,7 @@ def test_an_export_does_not_replace_a_file_of_its_bag(bag_path, tmp_path):
 
 
 def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path, tmp_path):
-    """A robot at rest too, whose messages compress a thousandfold."""
+    """A robot at rest is included, whose messages compress a thousandfold."""
     for name, step in {"moving": 0.01, "resting": 0.001}.items():
         bags = [tmp_path / name, tmp_path / f"{name}.zstd"]
         for path, compress in zip(bags, ("", "zstd")):

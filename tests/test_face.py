@@ -1,4 +1,4 @@
-"""The public face of the package: names, types, one-line reprs, and missing extras."""
+"""The public interface of the package: names, types, one-line reprs, and missing extras."""
 
 import importlib
 import inspect
@@ -145,7 +145,7 @@ def test_help_begins_with_every_name_of_the_package():
 
 @pytest.mark.parametrize("kind", ["fmu", "recording", "summary", "linear model", "sweep"])
 def test_a_notebook_shows_a_table_and_a_picture(kind, native_path, tmp_path):
-    """The HTML is well-formed, has no script, and names of third parties are text in it."""
+    """The HTML is well-formed, has no script, and shows third-party names as text."""
     hostile = "<script>alert(1)</script>&\"'"
     fmu = twodof.load_fmu(native_path)
     fmu = replace(fmu, robot=hostile)
@@ -217,14 +217,14 @@ def test_recording_has_what_the_samples_had(native_path, tmp_path):
 
 
 def program(names: list[str], code: str, folder: Path, *arguments: object) -> str:
-    """Run code where these modules cannot be imported; what it says."""
+    """Run code without some modules; return its output."""
     done = python("-c", WITHOUT.format(names=names) + code, *arguments, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def test_nothing_but_building_needs_pinocchio(native_path, tmp_path):
-    """A sweep's children inherit no modules: they find the same nothing on their path."""
+    """The child processes of a sweep cannot import it either."""
     for name in ("pinocchio", "coal", "pythonfmu"):
         (tmp_path / "absent").mkdir(exist_ok=True)
         (tmp_path / f"absent/{name}.py").write_text("raise ImportError('not here')")
@@ -278,5 +278,5 @@ def test_columns_of_a_csv_are_named_as_settings_are(native_path, tmp_path):
 
 
 def test_versions_are_of_what_is_installed():
-    """A run without Pinocchio still records its versions."""
+    """A run without Pinocchio also records versions."""
     assert versions("numpy", "no-such-package") == {"twodof": twodof.__version__, "numpy": np.__version__}

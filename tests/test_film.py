@@ -1,4 +1,4 @@
-"""Films of bags, read by FFmpeg and Pillow: the arm is where the bag has it."""
+"""Films of bags, read by FFmpeg and Pillow: the arm is at the position in the bag."""
 
 import sys
 from pathlib import Path
@@ -39,7 +39,7 @@ def frames(path: Path) -> list[np.ndarray]:
 
 
 def arm_box(picture: np.ndarray) -> np.ndarray:
-    """Least and most of x and y of the arm's pixels, y upwards."""
+    """Smallest and largest x and y of the arm's pixels, y upwards."""
     near = lambda *rgb: np.all([abs(a - b) < 25 for a, b in zip(rgb, GREY)], axis=0)  # noqa: E731
     place = pixels(picture[150:], near) * (1, -1)
     return np.array([place.min(axis=0), place.max(axis=0)])

@@ -41,7 +41,7 @@ def motion() -> Any:
 
 @pytest.fixture(scope="module")
 def bag(motion: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag whose joints are in another order, with a joint that the robot has not."""
+    """A bag whose joints are in another order, with a joint that the robot does not have."""
     q, effort = noisy(motion)
     other = np.zeros((len(q), 1))
     columns = [np.hstack([each[:, ::-1], other]) for each in (q, effort)]
@@ -175,7 +175,7 @@ def test_patterns_and_folders_are_checked(bag, tmp_path):
 
 
 def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, tmp_path):
-    """Positions that show 0.05 rad too little, efforts of 1/1.1, and a base that is tilted by 0.04 rad."""
+    """Positions are 0.05 rad too small, efforts are divided by 1.1, and the base is tilted by 0.04 rad."""
     q, effort = noisy(motion)
     bag = bag_of(tmp_path / "bag", JOINTS, q - [0.0, 0.05], effort / [1.0, 1.1])
     tilted = (9.81 * np.sin(0.04), -9.81 * np.cos(0.04), 0.0)
@@ -195,7 +195,7 @@ def test_a_bag_that_is_given_twice_is_refused(bag):
 
 
 def test_masses_near_zero_are_refused_in_a_line(bag, tmp_path):
-    """SciPy meets an infinity in the prior of such masses."""
+    """In SciPy the prior of such masses is infinite."""
     light = tmp_path / "light.urdf"
     light.write_text(re.sub(r'mass value="[^"]*"', 'mass value="1e-300"', ARM.read_text("utf-8")), "utf-8")
     with pytest.raises(InputError, match="masses, efforts or speeds are too large or too small"):

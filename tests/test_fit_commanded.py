@@ -34,7 +34,7 @@ def test_efforts_are_those_that_the_run_recorded(control, tmp_path):
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 30 s whose plant is MuJoCo's arm, with hidden values and noise that its controller sees."""
+    """A run of 30 s of MuJoCo's arm, with hidden parameters, and with noise in the controller's measurements."""
     folder = tmp_path_factory.mktemp("commanded")
     t = 0.01 * np.arange(3001)
     q = 0.3 * np.sin(np.outer(t, [5.3, 6.1])) + 0.6 * np.sin(np.outer(t, [2.1, 1.7]))

@@ -1,4 +1,4 @@
-"""The page of a fit as a browser shows it, its progress, and what an interrupt leaves."""
+"""The page of a fit in a browser, its progress, and interrupts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def motion() -> Any:
 
 @pytest.fixture(scope="module")
 def result(motion: Any, tmp_path_factory: pytest.TempPathFactory) -> twodof.Fit:
-    """A fit with a coordinate of the payload's place that a planar arm does not show."""
+    """A fit with a coordinate of the payload's position that a planar arm does not determine."""
     bag = bag_of(tmp_path_factory.mktemp("page") / "monday", JOINTS, *noisy(motion))
     return twodof.fit(ARM, bag, (*FREE, "payload_com"), gravity=GRAVITY)
 

@@ -49,7 +49,7 @@ def test_friction_armature_and_payload_of_an_arm_are_found(name, tmp_path):
 
 
 def changed_links(text: str, rng: np.random.Generator) -> str:
-    """A URDF whose masses, centres and inertias are others, each possible."""
+    """A URDF with other masses, centres and inertias, which are physically possible."""
     root = ET.fromstring(text)
     for inertial in root.iterfind("link/inertial"):
         factor = rng.uniform(0.8, 1.25)
@@ -107,7 +107,7 @@ def test_all_masses_of_a_ur5_that_can_be_seen_are_found(tmp_path):
 
 
 def efforts(robot: Any, names: list[str], values: np.ndarray, states: list[np.ndarray]) -> np.ndarray:
-    """Efforts at states, of links with masses, centres and inertias of the given names."""
+    """Efforts at states of links with given masses, centres and inertias."""
     model, given = robot.model.copy(), dict(zip(names, values))
     for joint in range(1, model.njoints):
         model.inertias[joint].setZero()

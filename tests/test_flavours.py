@@ -14,7 +14,7 @@ from twodof.export.compiler import UNITS
 
 
 def test_trajectories_of_both_flavours_agree(fmu_path, native_path):
-    """At their own tolerance; `test_control.py` has the rest at a tight one."""
+    """The tolerance is the default; `test_control.py` uses a tight one."""
     settings = {
         "q_min": (-0.2, 0.8),
         "q_max": (0.8, 1.9),
@@ -33,7 +33,7 @@ def test_trajectories_of_both_flavours_agree(fmu_path, native_path):
 
 
 def test_sources_compiled_without_any_flag_show_the_standard_functions_alone(native_path, tmp_path):
-    """Else libc's own advance(), or another FMU's functions, would be called instead."""
+    """Otherwise libc's advance(), or another FMU's functions, would be called instead."""
     with zipfile.ZipFile(native_path) as archive:
         archive.extractall(tmp_path)
     files = [tmp_path / "sources" / name for name in UNITS]
@@ -85,7 +85,7 @@ def test_options_that_do_not_fit_a_flavour_are_refused(options, message, tmp_pat
 
 
 def test_the_shipped_arm_s_file_is_known_by_what_it_was_made_of(tmp_path, monkeypatch):
-    """Without composing another, unless options or what is shipped are others, or it is damaged."""
+    """No FMU is composed for that, unless options or sources differ, or the file is damaged."""
 
     class ComposedError(Exception):
         pass
@@ -113,7 +113,7 @@ def test_the_shipped_arm_s_file_is_known_by_what_it_was_made_of(tmp_path, monkey
 
 
 def test_the_python_flavour_is_of_fmi_2(fmu_path, tmp_path):
-    """`fmi=2` is accepted for it."""
+    """It accepts `fmi=2`."""
     assert build_fmu(tmp_path / "A.fmu", FmuOptions(fmi=2)).read_bytes() == fmu_path.read_bytes()
     with pytest.raises(twodof.TwoDofError, match="native flavour only"):
         build_fmu(tmp_path / "B.fmu", FmuOptions(fmi=3))

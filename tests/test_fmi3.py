@@ -1,4 +1,4 @@
-"""FMI 3.0: the same plant behind other functions, with vectors; through FMPy, and from C."""
+"""FMI 3.0: the same plant with other functions and with vectors; through FMPy, and from C."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ def test_model_exchange_equals_co_simulation_with_stops(pair):
 
 
 def jacobians(instance, unknown, known):
-    """∂unknown/∂known by directional and by adjoint derivatives, arrays of the description."""
+    """∂unknown/∂known by directional and by adjoint derivatives, in the description's arrays."""
     u, k = instance.vr[unknown], instance.vr[known]
     n, m = instance.size[u], instance.size[k]
     directional = [instance.getDirectionalDerivative([u], [k], seed, n) for seed in np.eye(m)]
@@ -409,7 +409,7 @@ def test_restored_run_is_the_same_bit_for_bit(pair):
 
 @pytest.mark.long
 def test_random_calls_under_sanitizers(length):
-    """Legal and illegal calls; in full, 100,000 sequences."""
+    """Calls are legal and illegal; in full, 100,000 sequences."""
     count = length(100_000, 3_000)
     program = executable(
         model("twodof"),
@@ -429,7 +429,7 @@ FMUS = (("A_", "task", 3), ("B_", "joint", 3), ("C_", "effort", 2))
 
 
 def embedded(pair, folder, *target, suffix=""):
-    """The program of embedded.c, and what it is told: three FMUs' tokens and references of q."""
+    """The program of embedded.c, and its arguments: three FMUs' tokens and references of q."""
     compiler, objects, arguments = [*target, *FLAGS, "-w", f"-I{HEADERS}"], [], []
     folder.mkdir(exist_ok=True)
     for prefix, control, fmi in FMUS:
@@ -452,7 +452,7 @@ def embedded(pair, folder, *target, suffix=""):
 
 @pytest.fixture(scope="module")
 def here(pair, tmp_path_factory):
-    """embedded.c for Linux x86-64: what it prints, 50 rows of three arms' joints; its objects."""
+    """embedded.c for Linux x86-64: its output, 50 rows of three arms' joints; and its object files."""
     needs("ziglang")
     folder = tmp_path_factory.mktemp("embedded")
     program, arguments, objects = embedded(pair, folder, *ZIG, *TARGETS["x86_64-linux"])
@@ -478,10 +478,10 @@ def test_three_fmus_in_one_program(pair, here):
 
 
 def test_aarch64_equals_x86_64(pair, here, tmp_path):
-    """The sources, compiled for a Raspberry Pi or a Jetson, and run in an emulator.
+    """The sources are compiled for aarch64 and run in an emulator.
 
-    On the same C library: another's sin and cos differ in the last bit, of which the bare arm,
-    whose motion is chaotic, makes 4e-11 in 5 s.
+    The C library is the same: another one's sin and cos differ in the last bit, which the chaotic bare arm amplifies to
+    4e-11 in 5 s.
     """
     emulator = needs("qemu"), "-L", str(Path(needs("libc-arm64")).parents[1])
     program, arguments, _ = embedded(pair, tmp_path, *ZIG, *TARGETS["aarch64-linux"])
@@ -490,7 +490,7 @@ def test_aarch64_equals_x86_64(pair, here, tmp_path):
 
 
 def test_windows_equals_linux(pair, here, tmp_path):
-    """In wine; the bare arm's chaos over 2 s only, for Windows' sin and cos are others."""
+    """It runs in wine; the chaotic bare arm runs only 2 s, because Windows' sin and cos differ."""
     program, arguments, _ = embedded(pair, tmp_path, needs("mingw"), suffix=".exe")
     with wine(tmp_path) as (command, environment):
         there = printed([command, program, *arguments], **environment)
@@ -545,7 +545,7 @@ def test_fmpy_rebuilds_the_library_from_the_sources(pair, tmp_path):
 
 
 def test_fmu_is_as_small_as_that_of_fmi_2(pair):
-    """Its library has the engine of the other and more functions of the standard."""
+    """Its library has the same engine and more functions of the standard."""
     files, libraries = [], []
     for fmu in pair("panda_finger"):
         files.append(fmu.stat().st_size)

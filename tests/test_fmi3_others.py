@@ -48,7 +48,7 @@ DESCRIPTION = """\
 
 @pytest.fixture(scope="module")
 def oscillators(tmp_path_factory):
-    """q'' = −w2 q + f, two of them, from q = (1, 0.5)."""
+    """Two oscillators q'' = −w2 q + f, from q = (1, 0.5)."""
     folder = tmp_path_factory.mktemp("oscillators")
     headers = Path(fmpy.__file__).parent / "c-code"
     source = (HERE / "oscillators.c").read_text()

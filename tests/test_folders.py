@@ -18,7 +18,7 @@ from twodof.files import TEMPORARY, temporary_folder
 
 
 def test_an_abandoned_generator_removes_its_unzipped_fmu(fmu_path, tmp_path, monkeypatch):
-    """Also where the name has a space."""
+    """The FMU's name may contain a space."""
     parent = tmp_path / "a b"
     parent.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(parent))

@@ -1,4 +1,4 @@
-"""FMUs whose description was changed by hand: one line that names the culprit, for each command."""
+"""FMUs with a forged description: each command prints one line that names the culprit."""
 
 import re
 
@@ -29,7 +29,7 @@ from twodof.pages.arm import arm_of
     ],
 )
 def test_a_forged_fmu_is_refused_in_a_line(native_path, tmp_path, capsys, pattern, text, culprit):
-    """By one of the commands at least; by the others too, or they do without what is wrong."""
+    """At least one command refuses it; the others refuse it or do not use the forged part."""
     fmu = forged(native_path, tmp_path, pattern, text)
     lines = []
     bag = str(tmp_path / "bag")

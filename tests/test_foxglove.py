@@ -1,4 +1,4 @@
-"""A run served to Foxglove, received by the client of Foxglove's own viewer."""
+"""A run served to Foxglove, received by the client of Foxglove's viewer."""
 
 import json
 import os
@@ -25,7 +25,7 @@ from twodof.pages.foxglove import Foxglove
 
 
 def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path, tmp_path):
-    """The one of its viewer, in JavaScript; a gain is in the FMU within two steps."""
+    """The client is the viewer's, in JavaScript; a gain reaches the FMU within two steps."""
     client = Path(__file__).with_name("foxglove_client.js")
     node = needs("node")
     needs("foxglove")
@@ -66,7 +66,7 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path, tm
 
 
 def fields(value: Any) -> Any:
-    """Return the fields of a JSON message as ``listed`` gives them."""
+    """Return the fields of a JSON message as ``listed`` returns them."""
     parts = [*value.values()] if isinstance(value, dict) else value
     return [*map(fields, parts)] if isinstance(parts, list) else parts
 
@@ -93,7 +93,7 @@ def test_the_command_line_tells_where_it_listens(native_path, number):
     ],
 )
 def test_what_is_no_gain_is_ignored(native_path, caplog, name, value, reason):
-    """With one warning, however often it comes."""
+    """There is one warning, however often it arrives."""
     viewer = Foxglove(0, set_gains=True).begin(twodof.experiment(native_path))
     asked = {"name": name} if value is None else {"name": name, "value": value}
     with viewer, joined(viewer.url) as connection:
@@ -105,12 +105,12 @@ def test_what_is_no_gain_is_ignored(native_path, caplog, name, value, reason):
 
 
 def joined(url: str, **options: Any) -> Connection:
-    """A connection of Foxglove's protocol."""
+    """A connection by Foxglove's protocol."""
     return connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], **options)
 
 
 def ask(connection: Connection, asked: dict[str, Any]) -> list[Any]:
-    """Set a parameter; what then holds, as it is answered."""
+    """Set a parameter; return the value in the answer."""
     connection.send(json.dumps({"op": "setParameters", "parameters": [asked], "id": "a"}))
     while True:
         text = connection.recv(timeout=TIMEOUT)
@@ -129,7 +129,7 @@ def test_gains_are_set_where_asked_for_alone(native_path, caplog):
 
 
 def test_websites_but_foxgloves_own_are_refused(native_path):
-    """By Origin, and by Host where a website's name leads to this machine."""
+    """Origin decides, and Host if a website's name resolves to this machine."""
     with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
         url, own = viewer.url.replace("ws:", "http:"), ("Host", viewer.url.removeprefix("ws://"))
         protocol = ("Sec-WebSocket-Protocol", "foxglove.sdk.v1")
@@ -168,7 +168,7 @@ def test_gains_are_no_business_of_other_users(native_path, set_gains, status, mo
 
 @pytest.mark.needs("linux")
 def test_the_server_behind_the_door_answers_this_process_alone(native_path):
-    """All users see in the kernel's list of sockets where Foxglove's SDK listens."""
+    """Every user sees the port of Foxglove's SDK in the kernel's list of sockets."""
     with Foxglove(0, set_gains=True).begin(twodof.experiment(native_path)) as viewer:
         own = {os.path.realpath(f"/proc/self/fd/{n}").rpartition("/")[2] for n in os.listdir("/proc/self/fd")}
         rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()]

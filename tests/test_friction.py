@@ -24,7 +24,7 @@ MASS, FRICTION, KP, START = 2.0, 1.3, 40.0, 0.37
 
 
 def chain(rng, n):
-    """The URDF of a random chain of joints that turn and slide."""
+    """The URDF of a random chain of revolute and prismatic joints."""
     text = ['<robot name="chain"><link name="link0"/>']
     for i in range(1, n + 1):
         x = rng.normal(0, 1, (3, 3))
@@ -53,7 +53,7 @@ def slider(control: str) -> Engine:
 
 
 def states(native: Engine, plant, h: float, count: int, *, python: bool):
-    """q and v after each of so many steps, by one flavour."""
+    """q and v after each of some steps, by one flavour."""
     if python:
         for _ in range(count):
             plant.step(h)
@@ -198,7 +198,7 @@ def test_energy_never_grows(name, length):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_mujoco_agrees_when_each_joint_sticks(seed):
-    """With steps of 0.1 ms; its friction is soft, so that a joint sticks that is slow."""
+    """Steps are 0.1 ms; MuJoCo's friction is soft, so a slow joint counts as sticking."""
     rng = np.random.default_rng(seed)
     n, urdf = 3, chain(rng, 3)
     plant = from_urdf(urdf, "link3", "xyz", "effort").plant()

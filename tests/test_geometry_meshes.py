@@ -1,4 +1,4 @@
-"""Meshes in colours: against the files' own XML, and as pixels of a page."""
+"""Coloured meshes, compared with the files' own XML, and with the pixels of a page."""
 
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -27,7 +27,7 @@ DAE = "{http://www.collada.org/2005/11/COLLADASchema}"
 
 @pytest.mark.parametrize("name", ["link5", "hand"])
 def test_triangles_have_the_colours_of_their_materials(robots, name):
-    """Triangles of each colour are as many as the file's own lists say; the shape is coal's."""
+    """The number of triangles of each colour is that of the file's lists; the shape is coal's."""
     content = (robots / f"panda_description/meshes/visual/{name}.dae").read_bytes()
     tree = ET.fromstring(content)
     diffuse = {
@@ -117,7 +117,7 @@ URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/>
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_mesh_that_is_not_finite_is_not_drawn(number, caplog):
-    """A page whose numbers are not JSON shows nothing at all."""
+    """A page with numbers that JSON does not have would show nothing."""
     facet = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
     robot = read_urdf(URDF.replace("cube.obj", "cube.stl"))
     for value, text in ((2.0, ""), (number, "mesh 'cube.stl' is left out: it has a vertex that")):
@@ -132,7 +132,7 @@ SMALL: ViewportSize = {"width": 600, "height": 280}
 
 
 def test_a_replay_shows_them(tmp_path, monkeypatch):
-    """Both colours of the cube, and not the URDF's, which is for meshes without."""
+    """It shows both colours of the cube, and not the URDF's, which is for meshes without colours."""
     for name, text in {"cube.urdf": URDF, "cube.obj": CUBE, "colours.mtl": COLOURS}.items():
         (tmp_path / name).write_text(text)
     options = twodof.FmuOptions(urdf=tmp_path / "cube.urdf", axes="y", name="Cube")
@@ -156,7 +156,7 @@ def test_a_replay_shows_them(tmp_path, monkeypatch):
 
 
 def coloured(shown: np.ndarray) -> tuple[int, int]:
-    """Numbers of pixels that are red and green."""
+    """Numbers of red and of green pixels."""
     r, g, b = np.moveaxis(shown.astype(int), -1, 0)
     red, green = (r > 100) & (g < r / 2) & (b < r / 2), (g > 80) & (r < g / 2) & (b < g / 2)
     return int(red.sum()), int(green.sum())

@@ -1,5 +1,4 @@
-"""Malicious files, made by hand: a command refuses them with one clear line, or
-reads them for what they hold, in bounded time and memory."""
+"""Malicious files: a command refuses them with one clear line, or reads them in bounded time and memory."""
 
 import os
 import shutil
@@ -63,7 +62,7 @@ EXTERNAL = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
 
 
 def description(head: str = "", notes: str = "", variables: str = "") -> str:
-    """The modelDescription.xml of an FMU of another maker."""
+    """A third-party modelDescription.xml."""
     unknowns = '<Unknown index="1"/><Unknown index="2"/>'
     return (
         f'{head}<fmiModelDescription fmiVersion="2.0" modelName="m" guid="g">'
@@ -88,7 +87,7 @@ def external(encoding: str, declared: str = "") -> bytes:
 
 
 def fmu_of(xml: str | bytes, *more: tuple[str, bytes, int, int]) -> bytes:
-    """An FMU with a library that cannot be loaded: the last of all refusals of a run."""
+    """An FMU whose library cannot be loaded, which is the last refusal of a run."""
     content = {"modelDescription.xml": xml, "binaries/linux64/m.so": b"x"}
     members = []
     for name, value in content.items():
@@ -100,7 +99,7 @@ def fmu_of(xml: str | bytes, *more: tuple[str, bytes, int, int]) -> bytes:
 
 
 def bomb(name: str, declared: int) -> bytes:
-    """An FMU with a member of 10 GB of zeros, of which the directory may say that it is small."""
+    """An FMU with a member of 10 GB of zeros, whose size in the directory may be small."""
     zeros = mutations.deflated_zeros(10_000 * MIB)
     good = [] if name == "modelDescription.xml" else [description()]
     member = (name, zeros, declared, zlib.crc32(bytes(declared % 2**20)))
@@ -108,7 +107,7 @@ def bomb(name: str, declared: int) -> bytes:
 
 
 def many_members(count: int, size: int = 0) -> bytes:
-    """An FMU with members that are all the same data."""
+    """An FMU whose members are all the same data."""
     zeros = mutations.deflated_zeros(size)
     crc = zlib.crc32(bytes(size))
     same = [(f"{i:x}", zeros, size, crc) for i in range(count)]
@@ -116,7 +115,7 @@ def many_members(count: int, size: int = 0) -> bytes:
 
 
 def beside(content: str) -> bytes:
-    """An FMU of FMI 3.0 with some content in the file that says how it is built."""
+    """An FMU of FMI 3.0 with given content in its build description."""
     data = f'<fmiBuildDescription fmiVersion="3.0">{content}</fmiBuildDescription>'.encode()
     packer = zlib.compressobj(1, zlib.DEFLATED, -15)
     packed = packer.compress(data) + packer.flush()
@@ -166,7 +165,7 @@ def test_hostile_fmu_is_refused(hostile_fmu, jail):
 
 
 def arrays(*dimensions: str, step: str = "0.01", aliases: int = 0, name: str = "q", more: str = "") -> str:
-    """The modelDescription.xml of an FMU of FMI 3.0 whose output has these dimensions and so many other names."""
+    """The modelDescription.xml of an FMU of FMI 3.0 whose output has given dimensions and a number of aliases."""
     output = ' causality="output" variability="continuous"'
     inside = "".join(f"<Dimension {dimension}/>" for dimension in dimensions)
     inside += "".join(f'<Alias name="q{i}"/>' for i in range(aliases))
@@ -202,7 +201,7 @@ ARRAYS = {
 
 @pytest.mark.parametrize(("xml", "reason"), ARRAYS.values(), ids=ARRAYS)
 def test_fmu_without_end_is_refused(xml, reason, jail):
-    """Arrays that no memory holds, and steps with which no run ends."""
+    """Its arrays exceed every memory, or with its steps no run ends."""
     path = jail.input / "x.fmu"
     path.write_bytes(fmu_of(xml))
     jail.run("info", path)
@@ -243,7 +242,7 @@ def test_python_fmu_without_its_module_is_refused(name, jail, fmu_path):
 
 
 def test_fmu_of_any_name_is_read(jail, native_path):
-    """FMPy takes a file for a model description where its name says so."""
+    """FMPy would take a file with some names for a model description."""
     shutil.copyfile(native_path, jail.input / "x.xml")
     assert jail.run("info", jail.input / "x.xml").status == 0
 
@@ -287,7 +286,7 @@ def shapes(names: Iterable[str]) -> str:
 
 
 def meshes(folder: Path) -> None:
-    """Folders, pipes, devices and links in the place of meshes."""
+    """Folders, pipes, devices and links instead of meshes."""
     (folder / "in/folder").mkdir(parents=True)
     os.mkfifo(folder / "in/pipe")
     (folder / "in/zero").symlink_to("/dev/zero")

@@ -1,7 +1,6 @@
-"""Malicious bags, made by hand: read or refused in bounded time and memory.
+"""Malicious bags: read or refused in bounded time and memory.
 
-MCAP files are made record by record after the specification. What is refused for what it says is
-tested in test_records.py.
+MCAP files are made record by record by the specification. test_records.py tests refusals of contents.
 """
 
 import shutil
@@ -46,7 +45,7 @@ def mcap_of(*records: bytes) -> bytes:
 
 
 def zipped(content: bytes, times: int = 1) -> bytes:
-    """The same over and over, compressed at once."""
+    """The same bytes repeated, compressed in one piece."""
     packer = zstandard.ZstdCompressor().compressobj()
     return b"".join([*(packer.compress(content) for _ in range(times)), packer.flush()])
 
@@ -60,7 +59,7 @@ def with_mcap(make: Callable[[], bytes]) -> Callable[[Path], None]:
 
 
 def with_sql(script: str) -> Callable[[Path], None]:
-    """The database after some SQL, in the place of the MCAP file."""
+    """The database after some SQL, instead of the MCAP file."""
 
     def change(bag: Path) -> None:
         (file,) = bag.glob("*.mcap")
@@ -90,7 +89,7 @@ def many_files(bag: Path) -> None:
 
 
 def circle(bag: Path) -> None:
-    """Rows enough for pages of pages, whose children then are all the same full one."""
+    """Rows for several levels of pages, whose child pages then are all the same full page."""
     with_sql(f"{ENDLESS} INSERT INTO messages SELECT i + 99, 1, i, zeroblob(300) FROM r LIMIT 200000")(bag)
     file = bag / "bag.db3"
     pages = bytearray(file.read_bytes())
@@ -112,17 +111,17 @@ def lz4_zeros(size: int) -> bytes:
 
 
 def nothing(positions: int, names: int) -> bytes:
-    """A joint state that is nearly nothing when packed."""
+    """A joint state that compresses to almost nothing."""
     return serialised(joint_message(0, ["a"] * names, np.zeros(positions)))
 
 
 def channels(qos: str = "") -> list[bytes]:
-    """Almost as many as may be, each with a profile of its own."""
+    """Almost the largest number of channels, each with its own profile."""
     return [channel(i, f"/t{i}", f"{qos}{i}" if qos else "") for i in range(1, 1000)]
 
 
 def hollow(size: int, content: bytes) -> Callable[[Path], None]:
-    """A file of this size, that unpacks to the same over and over, 32 MiB a chunk, one at least."""
+    """A file of a given size that unpacks to equal chunks of 32 MiB, at least one."""
 
     def make() -> bytes:
         chunks = content * (32 * MIB // len(content))

@@ -40,7 +40,7 @@ def direction(points: Points) -> float:
 
 @pytest.mark.parametrize("q", [(0.5, 0.35), (0.2, 0.9), (1.2, -1.9)])
 def test_the_icon_is_of_the_robot_at_its_start(tmp_path, q):
-    """Two links of one length at q1 and q1 + q2, and a disc at each joint."""
+    """It has two links of one length at q1 and q1 + q2, and a disc at each joint."""
     fmu = build_fmu(tmp_path / "Arm.fmu", FmuOptions(q_start=q))
     link, last, discs = points_of(fmu)
     assert [direction(link), direction(last)] == pytest.approx([q[0], sum(q)], abs=0.02)

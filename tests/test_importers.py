@@ -35,8 +35,7 @@ Build = Callable[[str, int], tuple[str, list[float]]]
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """An FMU, without arrays, and where FMPy's co-simulation ends, which is where its law leads in
-    Python."""
+    """An FMU without arrays, and the final state of FMPy's co-simulation, which its law in Python confirms."""
 
     @functools.cache
     def build(control: str, fmi: int) -> tuple[str, list[float]]:
@@ -100,7 +99,7 @@ def test_casadi(control: str, fmi: int, built: Build, tmp_path: Path) -> None:
 
 @in_child_process
 def in_casadi(control: str, fmu: str, expected: list[float], folder: Path) -> None:
-    """Model Exchange by the classical Runge–Kutta method written here."""
+    """Run Model Exchange by a classical Runge–Kutta method."""
     import casadi
 
     dae = casadi.DaeBuilder("arm", str(fmpy.extract(fmu, str(folder / "unzipped"))))
@@ -189,7 +188,7 @@ class Controller(Fmi2Slave):
 
 
 def test_a_second_fmu_holds_the_arm_in_libcosim(built: Build, tmp_path: Path) -> None:
-    """It comes as near the target as the loop inside, by a way that a step of 1 ms leaves near."""
+    """It ends as near the target as the internal loop, along a path that differs by the step of 1 ms."""
     needs("libcosimpy")
     needs("libatomic")
     plant, _ = built("effort", 2)

@@ -1,4 +1,4 @@
-"""Robots by name: of example-robot-data and of robot_descriptions' cache, with their end effector and home pose."""
+"""Robots by name, of example-robot-data and the cache of robot_descriptions, with end effector and home pose."""
 
 import shutil
 from dataclasses import replace

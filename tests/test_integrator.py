@@ -17,19 +17,19 @@ def without_friction(limits, W=None):
 
 
 def advance(acceleration, q, v, h, limits, *tolerances):
-    """A step with stops that have no reaction."""
+    """Do a step with stops without reaction."""
     return integrator.advance(acceleration, q, v, h, without_friction(limits), *tolerances)
 
 
 def smooth(acceleration):
-    """Equations of motion whose J⁺ drops nothing anywhere."""
+    """Equations of motion whose J⁺ never drops a singular value."""
     return Equations(lambda q, v, rank, slip: (acceleration(q, v), 1, np.inf), lambda q: [1.0], 0.0, ())
 
 
 def jumping(acceleration, ratio):
-    """Equations of motion, q̈ by state and rank, whose J⁺ has rank 1 where a ratio of q is small.
+    """Equations of motion, q̈ by state and rank, whose J⁺ has rank 1 where a ratio, a function of q, is small.
 
-    The ratio changes with joint 1 by 1 per rad at the most.
+    The ratio changes with joint 1 by at most 1 per rad.
     """
 
     def response(q, v, rank, slip):
@@ -42,7 +42,7 @@ def jumping(acceleration, ratio):
 
 @pytest.fixture
 def budget(monkeypatch):
-    """Evaluations of a step, fewer than there are."""
+    """A number of evaluations of a step that is too small."""
     monkeypatch.setattr(integrator, "BUDGET", 20_000)
     return integrator.BUDGET
 
@@ -56,7 +56,7 @@ def test_coefficients_are_those_of_scipy():
 
 @pytest.mark.parametrize("rtol, atol", [(1e-3, 1e-6), (1e-8, 1e-10)])
 def test_steps_and_states_are_those_of_scipy(rtol, atol):
-    """A pendulum with a stiff spring: steps are rejected and grow again."""
+    """A pendulum has a stiff spring: steps are rejected and grow again."""
 
     def acceleration(q, v):
         return -400.0 * np.sin(q) - 0.3 * v + 50.0 * np.cos(3.0 * q)
@@ -88,7 +88,7 @@ def test_steps_and_states_are_those_of_scipy(rtol, atol):
 
 @pytest.mark.parametrize("h", [1e-3, 1e-2, 0.7])
 def test_constant_acceleration_stops_at_the_instant_of_contact(h):
-    """Into a wall, then held while pushed into it: polynomials, which the method has exactly."""
+    """A joint hits a wall and is pressed against it: the method is exact for polynomials."""
 
     def acceleration(q, v):
         return [3.0]
@@ -108,7 +108,7 @@ def test_constant_acceleration_stops_at_the_instant_of_contact(h):
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("h", [0.25, 1.0])
 def test_a_held_joint_is_released_where_its_acceleration_turns(side, h):
-    """Joint 2 is a clock of constant speed; joint 1 is pushed into its limit until t = 0.3."""
+    """Joint 2 is a clock of constant speed; joint 1 is pressed into its limit until t = 0.3."""
 
     def acceleration(q, v):
         return [side * (0.3 - q[1]), 0.0]
@@ -123,7 +123,7 @@ def test_a_held_joint_is_released_where_its_acceleration_turns(side, h):
 
 
 def test_a_release_between_two_looks_at_the_effort_is_found():
-    """q̈ = 1000 ((t − 0.875)² − ε²) pulls for 2ε, once within a step; the step ends where v is 0 again."""
+    """q̈ = 1000 ((t − 0.875)² − ε²) pulls for 2ε, once within a step; the step ends where v returns to 0."""
     width, h = 0.04, 0.875 + 2 * 0.04
 
     def acceleration(q, v):  # joint 2 is a clock of constant speed
@@ -147,7 +147,7 @@ def test_a_joint_at_rest_at_its_limit_is_not_released_where_nothing_pulls():
 
 
 def test_an_excursion_within_one_step_is_found():
-    """Thrown up to 1.25 mm past the limit and back within one 10 ms step."""
+    """A joint would move up to 1.25 mm beyond the limit and back within a step of 10 ms."""
 
     def acceleration(q, v):
         return [-200.0]
@@ -160,7 +160,7 @@ def test_an_excursion_within_one_step_is_found():
 
 
 def test_joints_stop_each_at_its_own_limit_and_leave_the_others_alone():
-    """Two within one step; one between them that turns in its range; one that has no room."""
+    """Two stop within one step; one between them turns in its range; one has no range."""
     q, v = advance(
         smooth(lambda q, v: [1.0, -2.0, 1.0, -7.0]),
         [0.0, 0.0, 0.0, 0.5],
@@ -191,7 +191,7 @@ def test_joints_that_reach_rigid_stops_within_picoseconds_stop_in_one_event():
 
 @pytest.mark.parametrize("h", [1e-3, 1e-2, 0.1])
 def test_a_change_of_rank_is_located(h):
-    """q̈ = 3 up to q = 0.05, then −7: polynomials, which the method has exactly."""
+    """q̈ is 3 up to q = 0.05, then −7: the method is exact for polynomials."""
     equations = jumping(lambda q, v, rank: [3.0 if rank == 2 else -7.0], lambda q: 0.06 - q[0])
     q, v = [0.0], [1.0]
     for _ in range(round(0.1 / h)):
@@ -204,7 +204,7 @@ def test_a_change_of_rank_is_located(h):
 
 @pytest.mark.parametrize("width", [0.02, 2e-4])
 def test_a_zone_of_lower_rank_is_not_missed_within_a_step(width):
-    """q̈ = −100 in a zone around q = 0.05, which is crossed in a part of a step; else 0."""
+    """q̈ is −100 in a zone around q = 0.05, which is crossed within a step, and 0 elsewhere."""
     equations = jumping(
         lambda q, v, rank: [0.0 if rank == 2 else -100.0], lambda q: 0.01 + abs(q[0] - 0.05) - width / 2
     )
@@ -238,7 +238,7 @@ def test_a_motion_that_both_ranks_lead_back_to_their_border_slides_along_it(stre
 
 @pytest.mark.parametrize("h", [0.01, 1e-3])
 def test_a_rank_that_drops_soon_is_not_held_while_a_joint_moves_far(h):
-    """q̈ = −k sgn(q) sweeps 0.5 mrad every 20 ns for some six periods; then the joint flies on freely."""
+    """q̈ = −k sgn(q) oscillates by 0.5 mrad with a period of 20 ns; after six periods the joint moves freely."""
     v0, k = 1e5, 1e13
     burst = 6.125 * 4.0 * v0 / k
 
@@ -253,7 +253,7 @@ def test_a_rank_that_drops_soon_is_not_held_while_a_joint_moves_far(h):
 
 
 def test_a_joint_that_bounces_on_a_clamp_within_nanoseconds_is_not_held_there():
-    """q̈ = −k (sin ωt − 0.5) for 6.35 periods of 0.1 µs, in each of which the joint leaves its limit and returns."""
+    """q̈ = −k (sin ωt − 0.5) for 6.35 periods of 0.1 µs; in each, the joint leaves its limit and returns."""
     k, period, h = 1e12, 1e-7, 1e-3
     omega, begun, burst = 2.0 * np.pi / period, 0.02 * period, 6.35 * period
 
@@ -272,7 +272,7 @@ def test_a_joint_that_bounces_on_a_clamp_within_nanoseconds_is_not_held_there():
 
 
 def test_a_jump_that_no_rank_explains_is_refused(budget):
-    """The same with one rank on both sides: what fails the error test is not taken."""
+    """Both sides have the same rank, so a step that fails the error test is not accepted."""
 
     def acceleration(q, v):
         return [-1e4 if q[0] + 0.01 * v[0] > 0.0 else 1e4]
@@ -284,7 +284,7 @@ def test_a_jump_that_no_rank_explains_is_refused(budget):
 
 @pytest.mark.parametrize("rate", [1e2, 1e4, 1e6])
 def test_a_stiff_motion_is_that_of_its_closed_form(rate):
-    """v̇ = −rate·(v − cos t): the step falls far below the largest."""
+    """v̇ = −rate·(v − cos t) needs steps much shorter than the largest."""
     clock = []
 
     def acceleration(q, v):  # joint 2 is a clock of constant speed

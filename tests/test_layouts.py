@@ -1,7 +1,7 @@
 """Layouts for RViz, PlotJuggler and Foxglove name the topics and fields that a run publishes.
 
-The tools themselves are not here: their files are read by parsers of YAML, XML and JSON, and each
-topic and field in them is looked for in a bag.
+The tools are not needed: parsers of YAML, XML and JSON read the files, and each topic and field in them is searched in
+a bag.
 """
 
 import json
@@ -30,7 +30,7 @@ def bag(request, tmp_path_factory):
 
 
 def dictionaries(tree: Any) -> list[dict[str, Any]]:
-    """All that are in what a file holds."""
+    """All dictionaries in a file's content."""
     parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
     return [tree] * isinstance(tree, dict) + [d for part in parts for d in dictionaries(part)]
 
@@ -57,7 +57,7 @@ def test_rviz_shows_the_topics_of_the_bag_as_they_are_offered(bag):
 
 
 def test_plotjuggler_draws_each_field_of_each_joint(bag):
-    """Under the names that it gives to a JointState's fields: topic, joint, field."""
+    """The names are those that PlotJuggler gives to the fields of a JointState: topic, joint, field."""
     root = ET.parse(bag.parent / "Arm 1.plotjuggler.xml").getroot()
     curves = {curve.get("name") for curve in root.iter("curve")}
     _, names, *_ = recorded(bag)["/joint_states"][0]

@@ -27,7 +27,7 @@ def bare(tmp_path_factory):
 
 
 def test_a_target_reached_has_the_poles_of_its_gains(native_path):
-    """s² + Kd s + Kp, found from a start that is elsewhere."""
+    """The polynomial is s² + Kd s + Kp; the equilibrium is found from another start."""
     at = {"Kp": [50.0, 80.0], "Kd": [10.0, 30.0]}
     model = twodof.linearise(native_path, at)
     expected = [*np.roots([1.0, 10.0, 50.0]), *np.roots([1.0, 30.0, 80.0])]
@@ -95,7 +95,7 @@ def test_a_joint_that_sticks_is_remarked_and_stays_and_one_that_begins_to_slip_i
 
 
 def test_a_free_joint_has_no_damping_and_what_falls_is_unstable(bare, capsys):
-    """Without gravity nothing holds joints; upright, two of four eigenvalues grow."""
+    """Without gravity, joints are free; upright, two of four eigenvalues are unstable."""
     free = twodof.linearise(bare, {"q": [0.3, 0.3], "gravity": 0.0})
     assert [mode.eigenvalue for mode in free.modes] == [0.0] * 4
     assert all(np.isnan(mode.damping) for mode in free.modes) and free.remarks == ()
@@ -110,7 +110,7 @@ def test_a_free_joint_has_no_damping_and_what_falls_is_unstable(bare, capsys):
 
 
 def test_a_pole_of_rounding_is_zero(native_path):
-    """Kp = 0 on one axis: its target is followed in velocity alone, and rounding left a pole."""
+    """With Kp = 0 on one axis, only velocity is controlled, and rounding gave a nonzero pole."""
     q = [0.4, 0.9]
     at = {"q": q, "x_des": oracles.position(np.array(q)), "Kp": [0.0, 50.0], "Kd": [10.0, 20.0]}
     model = twodof.linearise(native_path, at)
@@ -143,7 +143,7 @@ def singular_ratio(fmu, q):
 
 
 def test_singularities_of_the_orientation_count(ur10):
-    """The wrist's: positions alone are controlled as well as before."""
+    """The wrist is singular; positions alone can still be controlled."""
     wrist = [0.3, -1.2, 1.4, 0.2, 0.0, 0.3]
     (remark, _) = twodof.linearise(ur10, {"q": wrist}).remarks
     assert remark.startswith("a singular pose: σ_min/σ_max = ")
@@ -157,7 +157,7 @@ def test_singularities_of_the_orientation_count(ur10):
 
 
 def test_half_a_turn_from_the_target_is_refused(ur10):
-    """The turn back jumps there from one way round to the other."""
+    """The shortest rotation changes its direction there."""
     q = [0.3, -1.2, 1.4, 0.2, 0.8, 0.3]
     robot = load_robot(str(twodof.load_fmu(ur10).urdf), "tool0", "xyz")
     data, frame = robot.model.createData(), robot.model.getFrameId("tool0")
@@ -176,7 +176,7 @@ def test_half_a_turn_from_the_target_is_refused(ur10):
 
 @pytest.mark.parametrize(("tau", "told"), [(9.9, ""), (10.0, "refused"), (-12.0, "saturated")])
 def test_an_effort_limit_is_refused_or_told(tau, told, bare):
-    """The URDF's is 10 N·m."""
+    """The URDF's limit is 10 N·m."""
     at = {"q": [0.3, 0.4], "tau_cmd": [tau, 0.1], "limit_effort": True}
     if told == "refused":
         with pytest.raises(twodof.TwoDofError, match="joint 'joint1' is at its effort limit 10"):
@@ -189,7 +189,7 @@ def test_an_effort_limit_is_refused_or_told(tau, told, bare):
 
 
 def test_a_state_is_given_by_its_elements_too(bare):
-    """As settings are: what is not given is at its start, velocities at 0."""
+    """Other positions are at their start, and velocities are 0."""
     model = twodof.linearise(bare, {"q[1]": 1.0, "v_start[2]": 0.2, "v[1]": 0.5, "tau_cmd[2]": 0.1})
     point = [model.point[name] for name in ("q[1]", "q[2]", "v[1]", "v[2]", "tau_cmd[2]")]
     assert point == [1.0, 0.35, 0.5, 0.2, 0.1]
@@ -235,8 +235,10 @@ def test_the_command_prints_the_model(bare, capsys):
 
 @pytest.mark.parametrize("control", ["task", "effort"])
 def test_casadi_takes_the_fmu_and_has_the_same_jacobian(control, native_path, bare, tmp_path):
-    """Its states by fmi2SetReal, from their start attributes, and derivatives by fmi2GetReal; as
-    differences of the law in Python have it."""
+    """It sets states by fmi2SetReal from their start attributes, and reads derivatives by fmi2GetReal.
+
+    The Jacobian agrees with differences of the law in Python.
+    """
     import casadi
 
     path = {"task": native_path, "effort": bare}[control]

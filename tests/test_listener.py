@@ -1,6 +1,6 @@
 """Robots in closed loop with a controller in C++ on Fast DDS: lockstep, clock and pause.
 
-Truth is the loop closed in Python by the same equation, and the bag read by the MCAP project.
+The references are the loop closed in Python by the same equation, and the bag read by the MCAP project.
 """
 
 import functools
@@ -29,7 +29,7 @@ GOALS = {2: (0.9, -0.6), 7: (0.3, -0.4, 0.2, -1.8, 0.1, 1.6, 0.5)}
 
 
 def pd(sample: twodof.Sample, n: int) -> list[float]:
-    """As the controller in C++ computes it."""
+    """The effort of the controller in C++."""
     return answer(n, sample.q, sample.v)
 
 
@@ -66,13 +66,13 @@ def jointed(tmp_path_factory):
 
 
 def messages(bag: Path) -> list[tuple[str, int, bytes]]:
-    """Topics, stamps and bytes; where chunks of the file end is the clock's business."""
+    """Topics, stamps and bytes; the division of the file into chunks depends on the wall clock."""
     with (bag / f"{bag.name}.mcap").open("rb") as file:
         return [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages()]
 
 
 def closed(fmu: Path, n: int, steps: int, delay: Callable[[int], int]) -> Iterator[twodof.Sample]:
-    """The loop closed in Python; the command of step k is that of the sample so many before."""
+    """The loop closed in Python; the command of step k answers the sample a number of steps before."""
     past: list[list[float]] = []
     run = twodof.samples(fmu, step=0.01, stop_time=steps * 0.01)
     sample = next(run)
@@ -120,7 +120,7 @@ def test_lockstep_gives_the_same_bytes_each_time(bare, tmp_path, number, listen,
 
 
 def test_a_controller_in_real_time_misses_nothing(bare, tmp_path, number, listen, length):
-    """Each step has the answer to a sample of just before; with those delays, the same bits."""
+    """Each step uses the answer to a recent sample; with the same delays, results are bit-identical."""
     fmu, steps = bare(7), 100 * length(60, 4)
     node = listen("/joint_states", *control(7))
     bag = tmp_path / "bag"
@@ -219,7 +219,7 @@ def test_a_controller_that_stalls_dies_and_returns(bare, tmp_path, number, liste
 
 
 def test_commands_that_mean_nothing_or_are_absurd_end_no_run(bare, tmp_path, number, listen):
-    """The former have one warning a kind; a step with the latter is refused."""
+    """The former have one warning for each kind; a step with the latter is refused."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")
     yesterday = time.time_ns() - 86_400 * SECOND
@@ -264,7 +264,7 @@ def test_commands_that_mean_nothing_or_are_absurd_end_no_run(bare, tmp_path, num
 
 
 def test_a_flood_of_commands_holds_nothing_up(jointed, tmp_path, number, listen):
-    """Some 10,000 a second; the newest wins."""
+    """Some 10,000 arrive in a second; the newest applies."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")
     with published(number, jointed, "-o", str(bag)) as process:
@@ -282,7 +282,7 @@ def test_a_flood_of_commands_holds_nothing_up(jointed, tmp_path, number, listen)
 
 
 def test_names_of_topics(jointed, number, listen):
-    """A namespace is of names that do not begin with a slash."""
+    """A namespace applies to names without a leading slash."""
     options = ["--namespace", "left", "--state-topic", "/robot_joint_states", "--scene", "--clock"]
     node = listen("/robot_joint_states=state", "/clock=clock", "/left/arm/command=command")
     with published(number, jointed, *options, "--command-topic", "arm/command") as process:
@@ -301,7 +301,7 @@ def test_names_of_topics(jointed, number, listen):
 
 
 def test_several_robots_are_in_step_and_apart(bare, jointed, tmp_path, number, listen):
-    """One clock and its stamps for all, each at its time; who commands one moves one."""
+    """All share a clock and its stamps; a command moves only its robot."""
     robots = [f"left={jointed}", f"right={jointed}", str(bare(2))]
     names = ("left", "right", "Bare2")
     topics = [f"/{name}/joint_states" for name in names]

@@ -1,4 +1,4 @@
-"""A live arm, controlled and seen in a browser, against the closed form and other readers of bags."""
+"""A live arm, controlled and observed in a browser, against the closed form and other readers of bags."""
 
 import json
 import re
@@ -74,7 +74,7 @@ def arm(shown, command):
 
 @pytest.fixture
 def page(arm):
-    """A page whose arm is at its start, paused, with the inputs of the FMU, and seen as at first."""
+    """A page whose arm is at its start, paused, with the inputs of the FMU and the first view."""
     if arm.evaluate("arm.playing"):
         pause(arm)
     begin_anew(arm, "Defaults")
@@ -88,7 +88,7 @@ AS_AT_FIRST = "() => [...arm.defaults()].every(([name, start]) => arm.values.get
 
 
 def begin_anew(page: Page, name: str) -> None:
-    """Press a button that begins a run, until that has begun."""
+    """Press a button that restarts the run, and wait until it has restarted."""
     run = page.evaluate("arm.run")
     press(page, name)
     until(page, lambda now: now > run, lambda page: page.evaluate("arm.run"))
@@ -108,7 +108,7 @@ def time_of(found: dict[str, str]) -> float:
 
 
 def watch(page: Page, until_time: float, *, least: int = 1) -> list[dict[str, str]]:
-    """The readout at some moments, so many at least."""
+    """The readout at some moments, at least so many."""
     seen, end = [rows(page)], time.monotonic() + browser.TIMEOUT
     while time_of(seen[-1]) < until_time or len(seen) < least:
         assert time.monotonic() < end, seen[-1]
@@ -133,7 +133,7 @@ def assert_follows(
     kd: float = KD,
     rounded: float = ROUNDED,
 ) -> None:
-    """The arm goes from its start to the target as the closed form says."""
+    """Assert that the arm moves from its start to the target by the closed form."""
     t = np.array([time_of(found) for found in seen])
     x = np.array([numbers(found["end effector"])[:2] for found in seen])
     e = oracles.task_error(oracles.position(Q_START) - target, kp, kd, t)
@@ -143,7 +143,7 @@ def assert_follows(
 
 
 def test_target_is_dragged_and_followed_as_the_closed_form_says(command, page):
-    """Under gains of the sliders; time is kept, and the curves' samples are what is shown."""
+    """Sliders set gains; time is real, and the curves have the shown samples."""
     noted = page.evaluate("arm.noted")
     latest(command, lambda news: news["noted"] == noted + 1, ["change", {browser.HOSTILE: 0}])
     until(page, lambda text: "there is no variable" in text, told)  # a message that covers the ball
@@ -190,7 +190,7 @@ def test_target_is_dragged_and_followed_as_the_closed_form_says(command, page):
 
 
 def test_two_viewers_see_and_steer_the_same(command, page):
-    """The other is a websocket."""
+    """The second is a websocket."""
     with open_socket(socket_of(command)) as other:
 
         def sees(condition: Callable[[dict[str, Any]], bool]) -> None:
@@ -245,7 +245,7 @@ def test_who_gives_no_orders_is_not_listened_to(command, page):
 
 
 def test_a_flood_of_orders_stops_no_news(command, page):
-    """Nor another page's orders, and its own last one is followed."""
+    """Other pages' requests are executed too, and so is its own last one."""
     with open_socket(socket_of(command)) as flood, open_socket(socket_of(command)) as other:
         other.send('["play", true]')
         stopped = Event()
@@ -295,7 +295,7 @@ def test_a_setting_that_is_none_is_told_as_text(command, page):
 
 
 def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown, fmu_path, tmp_path):
-    """In the Python flavour; what is beyond the page's own pace is not waited for."""
+    """In the Python flavour; the recording does not wait for a page that reads too slowly."""
     with served("live", fmu_path, cwd=tmp_path) as command:
         place = urlsplit(socket_of(command))
         deaf = socket.create_connection((str(place.hostname), place.port or 0))
@@ -311,7 +311,7 @@ def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown, fmu_path, t
 
 
 def test_closing_the_last_page_pauses(native_path, tmp_path):
-    """And another signal ends as Ctrl-C does."""
+    """Another signal has the effect of Ctrl-C."""
     with served("live", native_path, cwd=tmp_path) as command:
 
         def stands() -> bool:
@@ -326,7 +326,7 @@ def test_closing_the_last_page_pauses(native_path, tmp_path):
 
 
 def latest(command: Served, condition: Callable[[dict[str, Any]], bool], *orders: list[Any]) -> dict[str, Any]:
-    """News that fulfil a condition, as told to a page that gives orders, and then leaves."""
+    """Updates that meet a condition, as sent to a page that makes requests and then closes."""
     with open_socket(socket_of(command)) as connection:
         for order in orders:
             connection.send(json.dumps(order))
@@ -336,7 +336,7 @@ def latest(command: Served, condition: Callable[[dict[str, Any]], bool], *orders
 
 
 def end(command: Served, folder: Path, number: signal.Signals) -> float:
-    """The last time in the bag of a command that is ended by a signal."""
+    """The last time in the bag of a command that a signal ends."""
     status, output, errors = command.interrupt(number)
     (bag,) = folder.glob("rosbag2_*")
     assert (status, errors) == (130, "")
@@ -351,7 +351,7 @@ def socket_of(command: Served) -> str:
 
 
 def test_who_has_no_token_is_refused(command):
-    """Another user of this machine, to whom the port is open."""
+    """Another user of this machine can reach the port."""
     token = urlsplit(command.url).query.removeprefix("token=")
     assert len(token) == 43
     for query in ("", "?token=", f"?token={token[:-1]}", f"?token={token}x", f"?{token}"):
@@ -374,7 +374,7 @@ def test_the_socket_is_guarded_as_the_page(command):
 
 
 def test_the_page_talks_to_its_server_alone(shown, command):
-    """By its policy: nothing else that it would ask for is asked for."""
+    """Its policy forbids all other requests."""
     with socket.create_server(("127.0.0.1", 0)) as other, shown.new_context() as context:
         context.set_default_timeout(1e3 * browser.TIMEOUT)
         page, port = context.new_page(), other.getsockname()[1]
@@ -474,7 +474,7 @@ def test_twenty_reconnects_leak_nothing(command, page):
 
 
 def test_seven_joints_without_a_mesh_to_a_pose(shown, panda, tmp_path):
-    """In the Python flavour; a target orientation of zeros is refused and ends nothing."""
+    """In the Python flavour; a target orientation of zeros is refused and does not end the run."""
     tree = ET.fromstring(panda)
     for link in tree.findall("link"):
         for part in [*link.findall("visual"), *link.findall("collision")]:

@@ -20,7 +20,7 @@ def loop_of(fmu: Path) -> Loop:
 
 
 def test_the_end_does_not_wait_for_orders(native_path):
-    """Some of which take long."""
+    """Some of the requests take long."""
     loop, asked = loop_of(native_path), iter([False, True])
     for _ in range(5):
         loop.tell("reset")
@@ -30,7 +30,7 @@ def test_the_end_does_not_wait_for_orders(native_path):
 
 @pytest.mark.parametrize("everything", [False, True])
 def test_orders_are_carried_out_in_turn(native_path, everything):
-    """Values set before a step hold for it, and values set after a reset are not reset."""
+    """Values set before a step apply to it, and values set after a reset are not reset."""
     loop = loop_of(native_path)
     for order, value in (
         ("change", {"x_des[1]": 0.11}),
@@ -50,7 +50,7 @@ def test_orders_are_carried_out_in_turn(native_path, everything):
 
 
 def test_there_are_no_news_of_a_run_without_a_sample(native_path):
-    """While a page asks for them all the time."""
+    """A page requests updates all the time."""
     loop, ended, counts = loop_of(native_path), Event(), set()
 
     def ask() -> None:
@@ -73,7 +73,7 @@ def test_there_are_no_news_of_a_run_without_a_sample(native_path):
 
 
 def test_orders_of_one_kind_become_one(native_path):
-    """The newest value wins, where nothing else is between them."""
+    """The newest value applies if no other request is between them."""
     loop = loop_of(native_path)
     for k in range(10_000):
         loop.tell("change", {"x_des[1]": k / 1e5, f"Kd[{1 + k % 2}]": float(k)})
@@ -115,7 +115,7 @@ def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path):
 
 
 def test_full_disk_ends_the_recording_alone(native_path, disk):
-    """One note says so, and a second one that another recording cannot begin."""
+    """One note reports it, and a second one that another recording cannot start."""
     bag = disk(8192) / "bag"
     loop, ended = Loop(experiment(native_path, stop_time=np.inf), bag=str(bag)), Event()
     loop.viewers = 1

@@ -1,4 +1,4 @@
-"""The master: times, order, ends, and FMUs that misbehave."""
+"""The master: times, order, ends, and faulty FMUs."""
 
 import logging
 import os
@@ -24,7 +24,7 @@ from twodof.simulation.pace import RealTime
 
 
 class Recorder(twodof.Sink):
-    """A sink that keeps what it is given."""
+    """A sink that keeps what it receives."""
 
     def __init__(self):
         self.samples = []
@@ -106,7 +106,7 @@ def test_a_run_that_is_asked_to_stop_ends_between_steps(native_path):
 
 
 class Clock:
-    """A clock that stands still while nobody sleeps, as on an infinitely fast machine."""
+    """A clock that advances only while a process sleeps, as on an infinitely fast machine."""
 
     def __init__(self):
         self.now = 1e6
@@ -176,7 +176,7 @@ def test_steering_holds_from_the_sample_on_that_it_answers(native_path):
 
 
 def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
-    """As a run that starts there, and is meant to be there."""
+    """The run continues like one that starts there with its target there."""
     recorder, fmu = Recorder(), twodof.load_fmu(native_path)
     reasons = []
 
@@ -205,7 +205,7 @@ def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
 
 
 def test_what_a_run_goes_on_with_holds_since_then(native_path, monkeypatch):
-    """Nothing was set before the step that is discarded."""
+    """No input was set before the discarded step."""
     fmu = twodof.load_fmu(native_path)
     broken: list[float] = []
     with instantiate(fmu) as instance:
@@ -344,7 +344,7 @@ def test_an_fmu_for_another_platform_says_which(fmu_path, tmp_path):
 
 @in_child_process
 def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
-    """Steps of 1 ms (that each takes seven right-hand sides only) into a bag: 52 bytes a step, and what waits."""
+    """Steps of 1 ms, with seven evaluations each, go into a bag: 52 bytes a step, and the queue."""
     run = twodof.experiment(fmu_path, stop_time=72.0, step=1e-3)
     memory = Memory(9000)  # by the first look the bag has stored something, and a block is judged
     twodof.simulate(run, twodof.Bag(tmp_path / "bag"), memory)
@@ -362,7 +362,7 @@ def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
     ids=["simulate", "urdf", "page", "sweep"],
 )
 def test_what_was_read_of_an_fmu_is_not_said_of_another(tmp_path, native_path, monkeypatch, use):
-    """Two robots' URDFs have one name, or one is built anew meanwhile."""
+    """Two robots' URDFs have one name, or one is rebuilt meanwhile."""
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "arm.fmu"
     path.write_bytes(native_path.read_bytes())
@@ -388,7 +388,7 @@ def test_options_beside_an_experiment_are_refused(native_path, how):
 
 
 def test_threads_stay_in_the_working_directory_while_an_fmu_is_loaded(tmp_path, native_path, fmu_path, monkeypatch):
-    """It is one for the whole process: files of others would be elsewhere."""
+    """The working directory belongs to the whole process."""
     monkeypatch.chdir(tmp_path)
     there, ended = [], threading.Event()
 

@@ -101,7 +101,7 @@ def found(name: str) -> str | None:
 
 
 def needs(name: str) -> str:
-    """Return where a tool is; without it the test is not run, or fails in CI."""
+    """Return the path of a tool; without it, the test is skipped, or fails in CI."""
     return found(name) or missing(name)
 
 

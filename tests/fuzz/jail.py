@@ -1,7 +1,6 @@
 """Processes that run commands on untrusted files under limits.
 
-Each is a process with limits of time and memory, in a folder tree where it may write below one
-folder alone.
+Each process has limits of time and memory, and may write only below one folder of a folder tree.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class Worker:
         )
 
     def run(self, *arguments: object) -> Outcome:
-        """Run a command; one that takes too long ends with the traceback of where it was."""
+        """Run a command; a command that takes too long ends with a traceback."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([*map(str, arguments)]) + "\n")
@@ -95,7 +94,7 @@ MODULES = (
 
 
 def serve() -> None:
-    """The worker: arguments come as lines of JSON, outcomes go."""
+    """Run a worker, which receives arguments as lines of JSON and returns outcomes."""
     for module in MODULES:
         importlib.import_module(module)
     requests = os.fdopen(os.dup(0), "r")
@@ -121,7 +120,7 @@ def serve() -> None:
 
 
 def run(arguments: list[str]) -> NoReturn:
-    """A command in this process, to its end."""
+    """Run a command in this process to its end."""
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     faulthandler.enable()
@@ -140,11 +139,11 @@ def run(arguments: list[str]) -> NoReturn:
 
 
 class Jail:
-    """A folder tree in which a command may write below ``target`` alone.
+    """A folder tree in which a command may write only below ``target``.
 
     Attributes:
-        input: for the files that a command is given.
-        target: for what it writes.
+        input: folder of the input files.
+        target: folder of the output files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -166,11 +165,11 @@ class Jail:
         self._worker.stop()
 
     def run(self, *arguments: object, prints: bool = False) -> Outcome:
-        """A command's outcome, after the checks of all that is promised of every command.
+        """Return the outcome of a command, after checking the guarantees of every command.
 
         Args:
-            arguments: of the command line.
-            prints: whether the command runs code that may print what it likes.
+            arguments: arguments of the command line.
+            prints: whether the command runs code that may print any text.
         """
         before = self._listing()
         outcome = self._worker.run(*arguments)
@@ -188,7 +187,7 @@ class Jail:
         return outcome
 
     def _listing(self) -> dict[str, tuple[int, int, int]]:
-        """All files but those below the target: mode, size and time of change."""
+        """All files outside the target: mode, size and time of change."""
         found = {}
         for folder, folders, files in os.walk(self._folder):
             for name in [*folders, *files]:
@@ -214,7 +213,7 @@ def jail(the_jail: Jail) -> Jail:
 
 
 def sparse(path: Path) -> None:
-    """Zeros that take no room on the disk."""
+    """Zeros that take no space on the disk."""
     with path.open("wb") as file:
         file.truncate(3000 * MIB)
 
@@ -229,7 +228,7 @@ SPECIAL: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 def without_slow(metafunc: pytest.Metafunc, tables: Mapping[str, Mapping[str, object]], slow: Collection[str]) -> None:
-    """Parameters of a test from the table of its name: without --full none that takes a second."""
+    """Parameters of a test from its table; without --full, none that takes a second."""
     full = metafunc.config.getoption("full")
     for name in tables.keys() & set(metafunc.fixturenames):
         table = {case: value for case, value in tables[name].items() if full or case not in slow}
@@ -237,7 +236,7 @@ def without_slow(metafunc: pytest.Metafunc, tables: Mapping[str, Mapping[str, ob
 
 
 def refused(jail: Jail, reason: str, *command: object) -> None:
-    """The command ends with this reason, and leaves nothing."""
+    """Assert that the command ends with this reason and leaves nothing."""
     outcome = jail.run(*command)
     assert outcome.status == 1
     assert re.search(reason, outcome.err), outcome.err
@@ -245,7 +244,7 @@ def refused(jail: Jail, reason: str, *command: object) -> None:
 
 
 def check_reading(jail: Jail, bag: Path) -> None:
-    """Reading changes nothing; recovery gives a bag that other readers open, and keeps the old."""
+    """Assert that reading changes nothing, and that recovery keeps the old bag and makes one that others open."""
     before = contents(bag)
     jail.run("info", bag)
     assert contents(bag) == before
@@ -264,7 +263,7 @@ def check_reading(jail: Jail, bag: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, bytes | int]:
-    """The files of a folder; of large ones the size."""
+    """The files of a folder; of large ones only the size."""
     sizes = {path: path.stat().st_size for path in folder.iterdir() if path.is_file()}
     return {p.name: p.read_bytes() if size < MIB else size for p, size in sizes.items()}
 

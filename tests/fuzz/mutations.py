@@ -1,7 +1,7 @@
 """Seeded mutations of files: of single bytes, and of the structure of a format.
 
-Each takes a ``random.Random`` and the bytes of a good file and gives the bytes of another. They
-use the standard library alone, and no code of the package.
+Each takes a ``random.Random`` and the bytes of a valid file, and returns the bytes of another file. They use only the
+standard library, and no code of the package.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def value(rng: Random) -> str:
 
 
 def several(*edits: Mutation, most: int = 3) -> Mutation:
-    """One to ``most`` edits, one after the other."""
+    """Make one to ``most`` edits in turn."""
 
     def mutate(rng: Random, data: bytes) -> bytes:
         for _ in range(rng.randint(1, most)):
@@ -132,7 +132,7 @@ def flip(rng: Random, data: bytes) -> bytes:
 
 
 def put(rng: Random, data: bytes, at: int, size: int, order: Literal["little", "big"] = "little") -> bytes:
-    """In place of an integer one that is often one too many, or far too large."""
+    """Replace an integer by another one, often one too large, or far too large."""
     old, top = int.from_bytes(data[at : at + size], order), 256**size - 1
     new = rng.choice(
         (
@@ -181,7 +181,7 @@ def overwrite(rng: Random, data: bytes) -> bytes:
 
 
 def region(rng: Random, data: bytes) -> bytes:
-    """Some bytes deleted, repeated, filled or made noise; copied elsewhere; or all from there."""
+    """Delete, repeat, fill or randomise some bytes, copy them elsewhere, or cut the file there."""
     start = rng.randrange(len(data) + 1)
     end = start + rng.randint(0, rng.choice((1, 4, 64, 4096, len(data))))
     part, at = data[start:end], rng.randrange(len(data) + 1)
@@ -208,7 +208,7 @@ blind = several(flip, overwrite, region, region, region, magic)
 
 
 def _token(rng: Random, data: bytes) -> bytes:
-    """A word or a number replaced."""
+    """Replace a word or a number."""
     tokens = [*re.finditer(rb"[\w.+-]+", data)]
     if not tokens:
         return data
@@ -217,7 +217,7 @@ def _token(rng: Random, data: bytes) -> bytes:
 
 
 def _lines(rng: Random, data: bytes) -> bytes:
-    """One dropped, elsewhere, twice or indented."""
+    """Drop, move, repeat or indent a line."""
     lines = data.splitlines(keepends=True) or [b""]
     line = lines.pop(rng.randrange(len(lines)))
     indented = rng.choice((b" ", b"\t", b"  - ", b"#")) + line
@@ -245,7 +245,7 @@ text = several(_token, _token, _lines, _encoding, flip, region)
 
 
 def _xml_tree(rng: Random, data: bytes) -> bytes:
-    """One to three changes of elements and attributes."""
+    """Make one to three changes of elements and attributes."""
     try:
         root = ET.fromstring(data)
         for _ in range(rng.randint(1, 3)):
@@ -357,7 +357,7 @@ ZIP_NAMES = (
 
 
 def _zip_field(rng: Random, data: bytes) -> bytes:
-    """A field of a header: sizes, offsets, flags (encryption, data descriptors), methods."""
+    """Change a field of a header: sizes, offsets, flags (encryption, data descriptors), methods."""
     kind = rng.choice((LOCAL, CENTRAL, CENTRAL, CENTRAL, END))
     places = [match.start() for match in re.finditer(re.escape(kind), data)]
     if not places:
@@ -367,7 +367,7 @@ def _zip_field(rng: Random, data: bytes) -> bytes:
 
 
 def _zip_member(rng: Random, data: bytes) -> bytes:
-    """One member more, one changed, or all packed by another method."""
+    """Add or change a member, or compress all by another method."""
     members = _members(data)
     if not members:
         return data
@@ -413,7 +413,7 @@ def zip_of(
     attributes: Mapping[str, int] | None = None,
     twice: str | None = None,
 ) -> bytes:
-    """A zip; names are written as they are, and one of them twice."""
+    """Return a zip archive with names as given, one of which occurs twice."""
     again = [] if twice is None else [(twice, b"x")]
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
@@ -428,7 +428,7 @@ def zip_of(
 
 
 def raw_zip(members: Iterable[tuple[str, bytes, int, int]]) -> bytes:
-    """A zip of names, deflated data, and the size and checksum that are said of it.
+    """Return a zip archive of names, deflated data, and stated sizes and checksums.
 
     Data that is the same object is written once: its members overlap.
     """
@@ -452,9 +452,9 @@ def deflated_zeros(size: int) -> bytes:
 
 
 def member(mutations: Mapping[str, Mutation], kept: str = "$") -> Mutation:
-    """The content of one member changed by the mutation of one of the patterns that it matches.
+    """Mutate the content of one member by the mutation of a pattern that matches its name.
 
-    Members that match ``kept`` stay as they are.
+    Members that match ``kept`` are unchanged.
     """
 
     def mutate(rng: Random, data: bytes) -> bytes:
@@ -526,7 +526,7 @@ CHUNK = b"\x06"
 
 
 def mcap_records(data: bytes) -> list[bytes]:
-    """Records with their heads; the last is what is left over, the closing magic in a good file."""
+    """Return records with their heads; the last item is the rest, in a valid file the closing magic."""
     records = []
     start = len(MCAP_MAGIC)
     while start + 9 <= len(data):
@@ -539,7 +539,7 @@ def mcap_records(data: bytes) -> list[bytes]:
 
 
 def _mcap_records(rng: Random, data: bytes) -> bytes:
-    """Records dropped, repeated, exchanged, of another kind or length, or with other numbers."""
+    """Drop, repeat or exchange records, or change their kind, length or numbers."""
     records = mcap_records(data)
     chunks = [i for i, record in enumerate(records) if record[:1] == CHUNK]
     i, j = rng.randrange(len(records)), rng.randrange(len(records))
@@ -564,7 +564,7 @@ def _mcap_records(rng: Random, data: bytes) -> bytes:
 
 
 def _mcap_chunk(rng: Random, data: bytes) -> bytes:
-    """Mutate the content of a chunk, which then has no checksum."""
+    """Mutate the content of a chunk, and remove its checksum."""
     records = mcap_records(data)
     chunks = [i for i, record in enumerate(records) if record[:1] == CHUNK and len(record) > 49]
     if not chunks:
@@ -634,7 +634,7 @@ TABLES = ("messages", "topics", "schema", "metadata", "message_definitions")
 
 
 def _sqlite_number(rng: Random, data: bytes) -> bytes:
-    """A field of the header; or in the head of a page its kind, free blocks, cells, pointers."""
+    """Change a field of the header, or in the head of a page its kind, free blocks, cells or pointers."""
     page = 4096 * rng.randrange(max(1, len(data) // 4096))
     of_page = (page + (0 if page else 100) + rng.randrange(16), rng.choice((1, 2, 4)))
     at, size = rng.choice((of_page, of_page, rng.choice(SQLITE_FIELDS)))
@@ -648,7 +648,7 @@ def _sqlite_statement(rng: Random, data: bytes) -> bytes:
 
 
 def sqlite_after(data: bytes, script: str) -> bytes:
-    """The database after some SQL; as it is where that fails."""
+    """Return the database after some SQL, unchanged if the SQL fails."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "db")
         path.write_bytes(data)

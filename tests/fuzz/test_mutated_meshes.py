@@ -26,7 +26,7 @@ KINDS = {".dae": mutations.xml, ".obj": mutations.text, ".off": mutations.text}
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """All cases with --full."""
+    """Generate all cases with --full."""
     if "seed" in metafunc.fixturenames:
         full = metafunc.config.getoption("full")
         metafunc.parametrize("seed", range(ALL_CASES if full else CASES))

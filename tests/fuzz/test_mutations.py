@@ -1,7 +1,6 @@
 """Commands on mutated files succeed, or fail with one clear line.
 
-Case i of a kind is made by ``random.Random(i)``, so that one that fails runs again on its own: its
-seed is in its name.
+Case i of a kind uses ``random.Random(i)``, so that a failing case runs again by its name, which contains the seed.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """All cases with --full."""
+    """Generate all cases with --full."""
     if "seed" in metafunc.fixturenames:
         full = metafunc.config.getoption("full")
         metafunc.parametrize("seed", range(ALL_CASES if full else CASES))
@@ -71,7 +70,7 @@ def test_mutated_fmu(seed: int, jail: Jail, native_path: Path, fmi3_path: Path, 
 
 
 def check_bag(jail: Jail, bag: Path, outcome: Outcome) -> None:
-    """A run that was refused leaves no bag, one that ended later a bag that can be read."""
+    """Assert that a refused run leaves no bag, and a run that ended later a readable bag."""
     if outcome.status == 0 or bag.exists():
         assert jail.run("info", bag).status == 0
     assert set(jail.target.iterdir()) <= {bag}
@@ -82,7 +81,7 @@ def check_bag(jail: Jail, bag: Path, outcome: Outcome) -> None:
 
 @pytest.fixture(scope="module")
 def urdfs(ur5: str, panda: str) -> list[tuple[bytes, list[str]]]:
-    """URDFs and what is said of each on the command line."""
+    """URDFs and their options on the command line."""
     shipped = (ROOT / "urdf/2dof.urdf").read_bytes()
     robots = [(shipped, ["--frame", "EndEffector", "--axes", "xy"])]
     for text, frame in ((ur5, "tool0"), (panda, "panda_link8")):
@@ -164,7 +163,7 @@ def test_mutated_bag(seed: int, jail: Jail, bags: dict[str, Path]) -> None:
 
 
 def mutate_bag(rng: Random, bag: Path, bags: dict[str, Path]) -> None:
-    """One or two changes of its files' content, and now and then of the files themselves."""
+    """Change the content of its files once or twice, and sometimes the files themselves."""
     for _ in range(rng.randint(1, 2)):
         files = sorted(path for path in bag.iterdir() if path.suffix in BAG_FILES)
         storage = [path for path in files if path.suffix in STORAGE_FILES]
