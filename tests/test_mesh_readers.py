@@ -1,4 +1,4 @@
-"""Meshes that break their reader: one warning that names them, and the others are drawn."""
+"""Meshes that end their reader: one warning names them, and the others are drawn."""
 
 import json
 import resource
@@ -49,7 +49,7 @@ def doubling(levels: int) -> bytes:
 
 
 def ply(vertices: int) -> bytes:
-    """A binary PLY that has more vertices by its head than bytes."""
+    """A binary PLY whose header states more vertices than it has bytes."""
     columns = "".join(f"property float {axis}\n" for axis in "xyz")
     return (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\n{columns}"
@@ -98,7 +98,7 @@ def test_few_meshes_may_end_their_reader(caplog):
 
 
 def test_time_of_a_robots_meshes_is_bounded(monkeypatch, caplog):
-    """Each of them takes less than one mesh may; a fresh reader has what the ones before it left."""
+    """Each takes less than the limit of one mesh; a new reader has the remaining time."""
     monkeypatch.setattr(meshes_module, "MAX_MESHES_SECONDS", 3)
     names = [f"{i}.dae" for i in range(24)]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -111,7 +111,7 @@ def test_time_of_a_robots_meshes_is_bounded(monkeypatch, caplog):
 
 
 def test_triangles_of_a_robot_are_bounded(caplog):
-    """A page of them would take gigabytes, whether of one file or of many uses of one."""
+    """A page of them would take gigabytes, whether from one file or from many uses of one."""
     many = MAX_TRIANGLES // 4
     content = bytes(80) + struct.pack("<I", many) + FACET * many
     with Meshes({"a.stl": content}.get) as meshes:
@@ -130,7 +130,7 @@ def test_without_trimesh_a_dae_has_no_colours(monkeypatch):
 
 
 def test_without_coal_a_mesh_is_left_out(tmp_path, monkeypatch, caplog):
-    """Its package is named; one child says so for all meshes."""
+    """One child names the missing package for all meshes."""
     (tmp_path / "coal.py").write_text("raise ImportError('there is no coal', name='coal')")
     monkeypatch.syspath_prepend(tmp_path)
     with Meshes({"a.stl": STL, "b.stl": STL}.get) as meshes:
@@ -169,7 +169,7 @@ FORGED = {
 
 @pytest.mark.parametrize(("answers", "reason"), FORGED.values(), ids=FORGED)
 def test_answers_of_a_reader_in_the_power_of_its_file(answers, reason, monkeypatch, caplog):
-    """Injected code may send what it likes; a pickle would be a program."""
+    """Injected code may send any answer; a pickle would run code."""
     monkeypatch.setattr(meshes_module, "serve", forging(answers))
     with Meshes({"a.stl": STL}.get) as meshes:
         assert meshes.scaled("a.stl", ONE) == []
@@ -177,7 +177,7 @@ def test_answers_of_a_reader_in_the_power_of_its_file(answers, reason, monkeypat
 
 
 class forging:  # noqa: N801
-    """A reader that answers so; a class, as a function that is sent has a name."""
+    """A reader with a forged answer; a class, because a function that is sent to a child needs a name."""
 
     def __init__(self, answers: list[bytes]) -> None:
         self.answers = answers
@@ -197,7 +197,7 @@ ROBOT = """<robot name="pair"><link name="base"/><link name="arm"><inertial><mas
 
 
 def test_all_that_draws_goes_on(tmp_path, monkeypatch, caplog):
-    """run --scene, view and page of a robot with such a mesh; build takes the file along."""
+    """run --scene, view and page of a robot with such a mesh; build includes the file."""
     monkeypatch.chdir(tmp_path)
     for name, content in {"r.urdf": ROBOT.encode(), "bad.dae": ITSELF, "good.stl": STL}.items():
         Path(name).write_bytes(content)

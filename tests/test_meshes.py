@@ -1,7 +1,7 @@
 """The default robot: its meshes are sound, and its URDF agrees with them.
 
-Mass properties are computed here by trimesh, from the committed files and the density that the
-URDF states; the script that made the files has its own integrals.
+trimesh computes mass properties from the committed files and the density in the URDF; the script that made the files
+has its own integrals.
 """
 
 import re
@@ -25,7 +25,7 @@ PRECISION = 1e-7  # m, that of single-precision corners
 
 
 def records(name: str) -> np.ndarray:
-    """The triangles exactly as the file holds them, without trimesh's merging."""
+    """The triangles exactly as stored, without trimesh's merging."""
     data = (ROOT / "meshes" / name).read_bytes()
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
     assert (len(data) - 84) / record.itemsize == int.from_bytes(data[80:84], "little")

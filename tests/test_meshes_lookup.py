@@ -43,7 +43,7 @@ def names(text: str) -> list[str]:
 
 
 def collect(disk: Path, uri: str, mesh_dir: str | None) -> bytes:
-    """The one mesh that a URDF with this name takes along."""
+    """The only mesh that is collected for a URDF with this name."""
     folder = disk / "ws/arm_description/urdf"
     text, files = collect_meshes(urdf(uri), folder, None if mesh_dir is None else disk / mesh_dir)
     assert names(text) == list(files)
@@ -163,7 +163,7 @@ def test_too_long_a_name_is_refused(disk):
 
 @pytest.mark.parametrize("uri", ["../meshes/base.stl", PACKAGE])
 def test_folder_of_the_urdf_alone_where_there_is_no_package(disk, uri):
-    """The names of parent folders have no effect: the home folder has a name too."""
+    """Names of parent folders have no effect."""
     (disk / "ws/arm_description/package.xml").unlink()
     with pytest.raises(BuildError, match="not found in"):
         collect(disk, uri, None)

@@ -32,7 +32,7 @@ DOWN = (0.3, -2.0, -9.81)
 
 
 def own_model(robots: Path, name: str) -> pin.Model:
-    """As Pinocchio has it, whose mimic joints have no velocity of their own; angles for circles."""
+    """Pinocchio's model, whose mimic joints have no velocity of their own, with angles instead of cos and sin."""
     tree = ET.parse(robots / name)
     for joint in tree.iter("joint"):
         if joint.get("type") == "continuous":
@@ -81,7 +81,7 @@ ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial></link>
 
 
 def test_a_mimic_of_a_mimic_follows_the_joint_that_moves() -> None:
-    """slide = 0.1 - copy/2 = 0.3 - turn; its range, -0.3 to 0.1, leaves turn in 0.2 to 0.6."""
+    """slide = 0.1 - copy/2 = 0.3 - turn; its range, -0.3 to 0.1, limits turn to 0.2 to 0.6."""
     robot = load_robot(HAND, "tip", "xyz")
     assert (robot.joints, robot.prismatic, robot.effort) == (("turn",), (False,), (7.0,))
     assert (*robot.q_min, *robot.q_max) == pytest.approx((0.2, 0.6), abs=1e-15)
@@ -104,7 +104,7 @@ def test_a_mimic_of_a_mimic_follows_the_joint_that_moves() -> None:
 
 @pytest.mark.parametrize("native", [False, True], ids=["python", "native"])
 def test_the_bag_of_either_flavour_moves_all_joints(tmp_path: Path, native: bool) -> None:
-    """The robot swings free; /tf has the transforms of the joints that follow."""
+    """The robot swings freely; /tf has the transforms of mimic joints."""
     (tmp_path / "hand.urdf").write_text(HAND)
     options = FmuOptions(urdf=tmp_path / "hand.urdf", control="effort", native=native)
     fmu = twodof.build_fmu(tmp_path / "hand.fmu", options)

@@ -130,7 +130,7 @@ MISTAKES: dict[str, str] = {
 
 @pytest.fixture(scope="module")
 def things(native_path, tmp_path_factory):
-    """A folder as of somebody who has worked for an hour."""
+    """A user's working folder after an hour."""
     folder = tmp_path_factory.mktemp("hour")
     shutil.copy(native_path, folder / "arm.fmu")
     shutil.copy(Path(__file__).parents[1] / "urdf/2dof.urdf", folder / "robot.urdf")

@@ -45,7 +45,7 @@ def test_cosine_and_sine_are_right_to_rounding(largest):
 
 
 def test_cosine_and_sine_are_right_where_arithmetic_is_not_the_standards():
-    """Sources may be compiled in any way by those who import them."""
+    """Importers may compile the sources with any flags."""
     angle = np.random.default_rng(6).uniform(-10.0, 10.0, 10_000)
     c, s = np.empty((2, len(angle)))
     Engine(model("twodof"), ("-mfpmath=387",)).call("turn", angle, float(len(angle)), c, s)
@@ -152,7 +152,7 @@ def test_controller_equals_pinocchio(name):
 @pytest.mark.parametrize("name", ["finger", "twodof", "ur5"])
 @pytest.mark.parametrize("singular", [1e-16, 1e-6, 0.005, 0.02, 0.5])
 def test_pseudo_inverse_equals_numpy(name, singular):
-    """With one, two and three rows, smallest singular value below and above rcond = 0.01."""
+    """It has one, two or three rows, and a smallest singular value below or above rcond = 0.01."""
     native = engine(name)
     rng = np.random.default_rng(4)
     for _ in range(200):
@@ -176,7 +176,7 @@ def test_pseudo_inverse_of_zero_is_zero():
 
 
 def follow(name, changes=None, targets=(), seconds=3.0, h=0.01, of=None):
-    """Largest deviation of q, v, x, tau; limits that were touched; smallest σ_min/σ_max."""
+    """Largest deviation of q, v, x and tau; touched limits; smallest σ_min/σ_max."""
     native = of or engine(name)
     plant = native.model.plant()
     for group, value in (changes or {}).items():
@@ -273,7 +273,7 @@ WEAK = """<robot name="weak"><link name="world"/>
 @pytest.mark.parametrize("limit_effort", [False, True])
 @pytest.mark.parametrize("kind, axis", [("revolute", "0 0 1"), ("prismatic", "1 0.5 0")])
 def test_damping_and_saturation(kind, axis, limit_effort):
-    """A damped arm that is too weak for its target; τ is seen to saturate."""
+    """A damped arm is too weak for its target; τ saturates."""
     of = Engine(from_urdf(WEAK.format(kind=kind, axis=axis), "tool", "xy"))
     x = np.array(of.model.starts["x_des"])
     changes = {"gravity": [0.0, -9.81, 0.0], "limit_effort": limit_effort}
@@ -295,7 +295,7 @@ def test_damping_changes_the_motion():
 
 
 def test_steps_across_singularities_stay_finite_and_inside():
-    """Reachable or not: every step ends, finite, within the limits, and without hanging."""
+    """Targets are reachable or not; each step ends with finite values within the limits."""
     native, plant = engine("twodof"), model("twodof").plant()
     rng = np.random.default_rng(5)
     x_des = [i for i, v in enumerate(native.model.table) if v.group == "x_des"]

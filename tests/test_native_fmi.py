@@ -57,7 +57,7 @@ class FMU2Arm(Recorded, FMU2Slave):
         return [self.get(group) for group in ("q", "v", "x", "tau")]
 
     def run(self, steps):
-        """A run with changing targets, as numbers to compare bit for bit."""
+        """Return a run with changing targets, as numbers to compare bit for bit."""
         rows = []
         for k in range(steps):
             if k % 40 == 0:
@@ -306,7 +306,7 @@ def test_foreign_and_damaged_states_are_refused():
 
 
 def forged(arm, field, value):
-    """The bytes of an instance's state with another value in a field, and the checksum right."""
+    """The bytes of an instance's state with another value in a field, and a valid checksum."""
     blob = arm.snapshot()
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
@@ -438,7 +438,7 @@ def test_library_exports_the_standard_needs_libc_alone_and_is_small():
 
 
 def test_no_memory_is_allocated_and_no_global_is_written():
-    """Outside of instantiation and saved states; no writable data but the linker's own."""
+    """Exceptions are instantiation and saved states. The linker's writable data is allowed."""
     wanted = {"instance.c": 1, "saved_state.c": 1}  # calls of the allocator
     for file, content in model("twodof").sources().items():
         if file.endswith(".c"):
@@ -449,7 +449,7 @@ def test_no_memory_is_allocated_and_no_global_is_written():
 
 @pytest.mark.long
 def test_random_calls_under_sanitizers(length):
-    """Legal and illegal calls, with NaN, infinities and more."""
+    """Calls are legal and illegal, with NaN, infinities and more."""
     count = length(100_000, 6_000)
     program = executable(
         model("twodof"),
@@ -464,7 +464,7 @@ def test_random_calls_under_sanitizers(length):
 
 @pytest.mark.long
 def test_instances_in_threads_share_nothing(length):
-    """Random calls on instances of several threads at once, under ThreadSanitizer."""
+    """Several threads make random calls on their instances under ThreadSanitizer."""
     count = length(25_000, 500)
     flags = ("-g", "-O1", "-pthread", "-fsanitize=thread")
     program = executable(model("twodof"), HERE / "fuzz.c", HERE / "fuzz2.h", flags=flags)

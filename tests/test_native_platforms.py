@@ -63,7 +63,7 @@ def without_zig(monkeypatch):
 
 
 def test_files_and_description(shipped, fmu_path):
-    """The same model description as the Python flavour's, up to what the flavours differ in."""
+    """The description is that of the Python flavour, except for the flavours' differences."""
     with zipfile.ZipFile(shipped) as archive:
         binaries = {name for name in archive.namelist() if name.startswith("binaries/")}
         ours = ET.fromstring(archive.read("modelDescription.xml"))
@@ -107,13 +107,13 @@ def fmi_functions() -> set[str]:
 
 
 def shown(*command: object) -> str:
-    """Return the output of one of binutils on a library."""
+    """Return the output of a binutils program on a library."""
     needs("binutils")
     return subprocess.check_output([*map(str, command)], text=True)
 
 
 def test_linux_library(unzipped):
-    """ELF: the FMI functions only, libc and libm only, of glibc 2.17 at most."""
+    """ELF: only FMI functions, libc and libm, of glibc 2.17 at most."""
     library = unzipped / BINARIES["linux64"]
     assert "X86-64" in shown("readelf", "-h", library) and library.stat().st_size < 200_000
     symbols = shown("readelf", "-W", "--dyn-syms", library)
@@ -127,7 +127,7 @@ def test_linux_library(unzipped):
 
 
 def test_windows_library(unzipped):
-    """PE: the FMI functions only; Windows itself and the C runtime that comes with it."""
+    """PE: only FMI functions, Windows and its C runtime."""
     library = unzipped / BINARIES["win64"]
     header, exported = shown("objdump", "-p", library).split("The Export Tables")
     assert "pei-x86-64" in header and library.stat().st_size < 200_000
@@ -139,7 +139,7 @@ def test_windows_library(unzipped):
 
 
 def test_mac_library(unzipped):
-    """Mach-O for both architectures, signed where macOS demands it, from macOS 11 on."""
+    """Mach-O for both architectures, from macOS 11 on, signed if macOS requires it."""
     data = (unzipped / BINARIES["darwin64"]).read_bytes()
     magic, count = struct.unpack_from(">II", data)
     assert (magic, count) == (0xCAFEBABE, 2)
@@ -189,7 +189,7 @@ def variables(fmu: Path) -> tuple[str, dict[str, int]]:
 def drive(
     unzipped: Path, platform: str, folder: Path, settings: dict[str, float], wine: tuple[str, dict[str, str]]
 ) -> subprocess.CompletedProcess[str]:
-    """Return the output of an importer compiled for the platform, of 5 s; Windows' runs in wine."""
+    """Return the output of an importer compiled for the platform, over 5 s; Windows programs run in wine."""
     windows = platform == "win64"
     importer = folder / ("host.exe" if windows else "host")
     if not importer.exists():
@@ -233,7 +233,7 @@ RUNS = {
 
 @pytest.fixture(scope="module")
 def machines(tmp_path_factory):
-    """A folder for the importer of each platform and for wine, and how to call wine."""
+    """A folder for the importer of each platform and for wine, and the command of wine."""
     folder = tmp_path_factory.mktemp("machines")
     with wine(folder) as called:
         yield folder, called
@@ -273,7 +273,7 @@ needs_linux = pytest.mark.needs("linux64")
 
 @needs_linux
 def test_fmpy_rebuilds_the_library_from_the_sources(shipped, tmp_path, monkeypatch):
-    """With FMPy's own flags: functions keep their meaning where no flag hides their names."""
+    """FMPy's flags hide no names; functions must still not be replaced by others."""
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
     needs("cmake")
     needs("make")
@@ -304,7 +304,7 @@ def test_own_compiler_serves_without_zig(shipped, tmp_path, without_zig):
 
 
 def test_equal_bytes_from_an_empty_cache_without_a_home(unzipped, monkeypatch):
-    """zig's cache is a temporary one where there is no home to keep it in."""
+    """Without a home folder, zig's cache is temporary."""
     for name, value in (("HOME", "/dev/null"), ("XDG_CACHE_HOME", ""), ("ZIG_GLOBAL_CACHE_DIR", "")):
         monkeypatch.setenv(name, value)
     sources = {path.name: path.read_bytes() for path in (unzipped / "sources").iterdir()}
@@ -317,7 +317,7 @@ def test_equal_bytes_from_an_empty_cache_without_a_home(unzipped, monkeypatch):
 
 @pytest.fixture
 def raspberry(monkeypatch):
-    """This machine says that it is a Raspberry Pi or a Jetson."""
+    """A machine that identifies itself as a Raspberry Pi or a Jetson."""
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setattr("fmpy.platform_tuple", "aarch64-linux")  # as it says there
@@ -369,7 +369,7 @@ def test_fmi_2_on_a_raspberry_is_refused_at_the_build(raspberry, tmp_path, monke
 
 
 def test_fmi_2_on_a_raspberry_is_refused_at_the_run(raspberry, fmu_path, tmp_path, capsys):
-    """linux64 means x86-64; FMPy takes it for the name of any Linux of 64 bits."""
+    """linux64 means x86-64; FMPy accepts it on any 64-bit Linux."""
     assert fmpy.platform == "linux64"
     assert main(["build", "-o", str(fmu_path)]) == 0
     assert capsys.readouterr().out.split("next")[1].startswith("\n  twodof build --native\n")
@@ -383,7 +383,7 @@ def test_fmi_2_on_a_raspberry_is_refused_at_the_run(raspberry, fmu_path, tmp_pat
 
 
 def test_fmi_3_needs_none_of_fmpys_logger(tmp_path):
-    """FMPy has it for no aarch64-linux, and says so where it is imported, on standard output."""
+    """FMPy has no logger for aarch64-linux, and prints that on import."""
     code = """import sys
 sys.modules["fmpy.logging"] = None  # cannot be imported
 from twodof import samples

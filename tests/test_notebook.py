@@ -24,7 +24,7 @@ PICTURES = {"first_run": 5, "my_robot": 1, "my_controller": 0, "gains": 1, "line
 
 
 def outputs(notebook: nbformat.NotebookNode) -> list[list[tuple[list[str], str]]]:
-    """Kinds of each cell's outputs, and their HTML without the numbers, which depend on the machine's speed."""
+    """Kinds of each cell's outputs, and their HTML without numbers, which depend on the machine's speed."""
     return [
         [(sorted(output.get("data", ())), without_numbers(output)) for output in cell.outputs]
         for cell in notebook.cells
@@ -62,7 +62,7 @@ def test_an_arm_is_shown_without_what_takes_long_to_import(native_path):
 
 @pytest.mark.parametrize(("silence", "shown"), [(0, True), (1e6, False)])
 def test_a_notebook_shows_bars_of_what_takes_long(native_path, tmp_path, silence, shown):
-    """Text where ipywidgets are missing, else widgets; a script shows none."""
+    """They are text without ipywidgets, else widgets; a script shows none."""
     shutil.copy(native_path, tmp_path / "arm.fmu")
     begin = f"import os, twodof\nfrom twodof.simulation import progress\nprogress.SILENCE = {silence}"
     begin += "\nos.environ.pop('TQDM_DISABLE', None);"
@@ -78,7 +78,7 @@ def test_a_notebook_shows_bars_of_what_takes_long(native_path, tmp_path, silence
 
 @pytest.mark.parametrize(("tick", "shown"), [(0.05, True), (1e6, False)])
 def test_a_notebook_shows_a_line_of_a_slow_build(tmp_path, tick, shown):
-    """Each text of the line, and the cell's output once the build is done; a script shows none."""
+    """It returns each text of the line, and the cell's output after the build; a script shows none."""
     begin = f"import os, twodof\nfrom twodof import notebook\nnotebook.TICK = {tick}"
     begin += "\nos.environ.pop('TQDM_DISABLE', None);"
     watch = """from IPython.display import DisplayHandle
@@ -105,7 +105,7 @@ def test_a_cell_that_fails_is_an_error(tmp_path):
 
 
 def test_pages_are_shown_inline_without_a_network(native_path, tmp_path):
-    """An arm that moves, a replay and a map, in the frames that a notebook puts into its page."""
+    """An arm that moves, a replay and a map, in iframes of the notebook."""
     folder = tmp_path / "sweep"
     twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=1)
     table = twodof.sweep(native_path, grid={"Kp": [20, 60]}, stop_time=1, output=folder)

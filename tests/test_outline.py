@@ -16,7 +16,7 @@ MOST = 2000
 
 @pytest.fixture(scope="module")
 def bag(native_path, tmp_path_factory):
-    """A run of 20,000 steps whose target, given on a topic too, jumps often; for one step once."""
+    """A run of 20,000 steps whose target, also on a topic, jumps often, once for a single step."""
     folder = tmp_path_factory.mktemp("long")
     table = folder / "targets.csv"
     random = np.random.default_rng(2)
@@ -43,7 +43,7 @@ def lines_of(track: Track) -> list[Array]:
 
 
 def test_every_line_keeps_its_extremes_wherever_it_is_looked_at(bag):
-    """In each twentieth of the time, with no more between than that of the spans at its ends."""
+    """This holds in each twentieth of the time, up to the spans at its ends."""
     whole, few = track_of(bag, 10**6), track_of(bag, MOST)
     assert len(whole.t) == whole.recording.count == few.recording.count == 20_001
     assert MOST / 16 < len(few.t) <= MOST / 4
@@ -69,7 +69,7 @@ def test_what_is_told_of_a_long_bag_is_told_of_all_its_samples(bag):
 
 
 def test_a_target_on_a_topic_is_that_of_its_time(bag, tmp_path):
-    """The bag has no provenance; repeated points are not kept."""
+    """The bag has no provenance; repeated points are dropped."""
     (bag / "run.json").rename(tmp_path / "run.json")
     try:
         whole, few = read_bag(bag), read_downsampled(bag, MOST, lambda part: [*part.target.T])

@@ -22,7 +22,7 @@ OLD, NEW = b"old", b"new" * 100_000
 
 @pytest.fixture
 def umask():
-    """Sets the umask for a test."""
+    """Set the umask for a test."""
     before = os.umask(0o022)
     yield os.umask
     os.umask(before)
@@ -55,7 +55,7 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path):
 @pytest.mark.parametrize("write", [lambda path: write_file(path, NEW), lambda path: twodof.Bag(path, overwrite=True)])
 @pytest.mark.parametrize(("mode", "owner"), [(0o1777, 2), (0o1777, 1), (0o1777, 0), (0o1755, 2), (0o777, 2)])
 def test_a_link_of_another_user_in_a_shared_folder_is_not_followed(mode, owner, write, tmp_path, monkeypatch):
-    """The rule, and what it permits, are those of Linux's fs.protected_symlinks; user 1 runs, root owns the folder."""
+    """The rule is that of Linux's fs.protected_symlinks; user 1 runs, root owns the folder."""
     (folder := tmp_path / "shared").mkdir()
     planted, near, target = folder / "planted", tmp_path / "near", tmp_path / "absent"
     planted.symlink_to(target)
@@ -104,7 +104,7 @@ def test_modes_are_those_of_the_umask(mask, umask, tmp_path, native_path):
 
 
 def test_a_file_that_is_replaced_keeps_its_mode(umask, tmp_path):
-    """A private file must not become one that all may read."""
+    """A private file must not become readable for all."""
     umask(0o022)
     path = tmp_path / "file"
     for kept in (0o600, 0o664, 0o444):
@@ -162,7 +162,7 @@ def bag(tmp_path_factory, native_path):
 
 
 def twodof_to(output: int | io.BufferedRandom, *arguments: object) -> bytes:
-    """Return the standard output of a command, which prints its words on standard error."""
+    """Return the standard output of a command that prints facts on standard error."""
     command = [sys.executable, "-m", "twodof", *map(str, arguments)]
     done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, check=True)
     assert done.stderr.splitlines()

@@ -63,7 +63,7 @@ def browser() -> Iterator[Browser]:
 
 @contextmanager
 def shown(browser: Browser, path: Path, begin: str = EVERY_OTHER_FRAME, **context: Any) -> Iterator[Page]:
-    """A page from its file, without a network; it asks for nothing and complains of nothing."""
+    """A page from its file, without a network; it makes no requests and logs no errors."""
     with browser.new_context(viewport=VIEWPORT, offline=True, accept_downloads=True, **context) as opened:
         opened.set_default_timeout(1e3 * TIMEOUT)
         page = opened.new_page()
@@ -112,7 +112,7 @@ def panda(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stepped(path: Path, parameters: dict, script: Script, steps: int) -> np.ndarray:
-    """Samples by FMPy, N × (q, v, x, tau): inputs set before steps by number."""
+    """Samples by FMPy, N × (q, v, x, tau); inputs are set before steps by number."""
     fmu = twodof.load_fmu(path)
     names = [name for group in ("q", "v", "x", "tau") for name in fmu.vector(group)]
     with instantiate(fmu) as instance:
@@ -206,7 +206,7 @@ NO_ORIENTATION = "quat_des = 0, 0, 0, 0 is not an orientation; the identity is (
 
 
 def refused(page: Page, code: str, *arguments: object) -> str:
-    """Return the message on a refused value."""
+    """Return the message about a refused value."""
     words = "{ try { %s; } catch (error) { return error.message; } }"
     return str(page.evaluate(f"([a, b]) => {words % code}", [*arguments, None, None][:2]))
 
@@ -237,7 +237,7 @@ CUT = """() => [...document.querySelectorAll("#arm-readout td, .slider span")]
 
 
 def test_all_is_seen_of_a_robot_and_its_names(browser, tmp_path) -> None:
-    """Not even where a bare plant hangs down is it behind a button."""
+    """Buttons hide no part, even of a bare plant that hangs down."""
     ur10 = built(tmp_path, "ur10_robot", frame="tool0", control="effort", meshes=False)
     with shown(browser, twodof.page(ur10, tmp_path / "ur10.html")) as page:
         for size in (VIEWPORT, PHONE):
@@ -255,7 +255,7 @@ def test_all_is_seen_of_a_robot_and_its_names(browser, tmp_path) -> None:
 
 
 def test_the_arm_is_seen_in_the_dark(page) -> None:
-    """As graphics of the Web Content Accessibility Guidelines are to be: 3 to 1."""
+    """The contrast is at least 3 to 1, as the Web Content Accessibility Guidelines require of graphics."""
     places = [pixels(picture(page), colour) for colour in LINKS]
     for scheme, least in (("dark", 3.0), ("light", 2.0)):
         page.emulate_media(color_scheme=scheme)
@@ -269,7 +269,7 @@ def test_the_arm_is_seen_in_the_dark(page) -> None:
 
 
 def luminance(colour: np.ndarray) -> float:
-    """Relative, of sRGB."""
+    """Relative luminance of sRGB."""
     c = colour / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return float(linear @ (0.2126, 0.7152, 0.0722))
@@ -363,7 +363,7 @@ def arms(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]
 
 
 def test_a_joint_that_moves_no_target_is_no_cause(browser, panda, tmp_path) -> None:
-    """A Panda whose fingers are closed: only the joint of the arm that is at its limit is named."""
+    """A Panda's fingers are closed: only the arm's joint at its limit is named."""
     with shown(browser, twodof.page(panda, tmp_path / "panda.html")) as page:
         page.evaluate("""() => { arm.play(false); arm.startAgain(true); arm.set("x_des", [0.5, 0.1, 0.4]);
             arm.set("q_start[7]", arm.values.get("q_max[7]")); }""")
@@ -372,7 +372,7 @@ def test_a_joint_that_moves_no_target_is_no_cause(browser, panda, tmp_path) -> N
 
 
 def test_a_run_that_reaches_its_target_has_no_cause(browser, arms) -> None:
-    """At the target, on the way to it and after a drag to another, in all steps."""
+    """At the target, on the way to it and after a drag to another, at each step."""
     with shown(browser, arms["task"]) as page:
         page.evaluate("() => { arm.play(false); arm.startAgain(true); }")
         for target in ([0.2, 0.05], [-0.1, 0.2], [-0.2, 0.1]):
@@ -480,7 +480,7 @@ def test_units_stand_beside_the_sliders(page) -> None:
 
 
 def test_a_robot_in_space_stands_on_a_floor_with_its_shadow(browser, panda, tmp_path) -> None:
-    """The shadow's pixels are where the floor's point below the hand is seen, and go with it."""
+    """The shadow is drawn at the floor's point below the hand, and moves with it."""
     with shown(browser, twodof.page(panda, tmp_path / "panda.html"), begin=EVEN_FRAMES) as page:
         page.evaluate("arm.play(false)")
         places = []

@@ -1,6 +1,6 @@
-"""Model Exchange sees stops that joints reach and leave within one step of the importer's solver.
+"""Model Exchange detects stops that joints reach and leave within one step of the importer's solver.
 
-By FMPy's CVode, and by a solver of the tests' own: Runge-Kutta of order 4 with located events.
+Solvers are FMPy's CVode, and a Runge-Kutta method of order 4 with located events.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ STATES = [f"{s}[{i}]" for s in "qv" for i in (1, 2)]
 
 @pytest.fixture(scope="session")
 def fmus(tmp_path_factory):
-    """FMUs by version of FMI and control, each built where it is asked for."""
+    """FMUs by version of FMI and control, each built on demand."""
     folder, built = tmp_path_factory.mktemp("passed"), {}
 
     def build(fmi=2, control="effort"):
@@ -58,7 +58,7 @@ def simulated(fmu, kind, starts, stop_time, interval=0.05, **named):
 
 
 class Importer(Recorded):
-    """A solver with steps of a length, each of so many parts, on an instance of either version."""
+    """A solver with steps of a length, each of some parts, on an instance of either version."""
 
     three = False
 
@@ -124,7 +124,7 @@ class Importer(Recorded):
         return self.vector(rates, self.n)
 
     def advanced(self, t, y, h, parts):
-        """The state at t + h, which the instance has then."""
+        """Return the state at t + h, and set it in the instance."""
         step = h / parts
         for k in range(parts):
             at = t + k * step
@@ -136,7 +136,7 @@ class Importer(Recorded):
         return y
 
     def located(self, t, y, h, parts, before):
-        """As long a step until just after the first event."""
+        """Return the longest step that ends just after the first event."""
         low = 0.0
         while h - low > 2e-15:
             middle = (low + h) / 2
@@ -150,7 +150,7 @@ class Importer(Recorded):
         return h
 
     def run(self, stop_time, h, interval=0.05, parts=1, obeys=True, tells=True):
-        """States at each interval; the instance is told of completed steps and obeyed, or not."""
+        """Return states at each interval; the instance learns of completed steps, and is obeyed, or not."""
         t, y, rows = 0.0, self.y, [self.y]
         before = self.indicators > 0.0
         while len(rows) <= round(stop_time / interval):
@@ -189,7 +189,7 @@ class FMU3Importer(Importer, FMU3Model):
 
 @pytest.fixture
 def importer(fmus):
-    """Opens importers, which are closed at the end."""
+    """Open importers, which are closed at the end."""
     opened = []
 
     def build(starts=(), fmi=2, control="effort"):
@@ -203,7 +203,7 @@ def importer(fmus):
 
 
 def test_the_touch_is_as_short_as_is_said(importer):
-    """Without stops; by differences of what an importer's own solver gives."""
+    """Without stops, by differences of an importer's own solver."""
     rows = importer({**TOUCH, **FREE}).run(0.08, 1e-5, 1e-5)
     below = np.flatnonzero(rows[:, 1] < -math.pi)
     assert 1.8e-7 < -math.pi - rows[:, 1].min() < 2.2e-7
@@ -231,8 +231,10 @@ def test_runge_kutta_sees_a_short_stop(fmus, importer, fmi, h):
 
 
 def test_a_short_stop_of_a_closed_form(importer):
-    """q = q_des (1 - cos wt) turns at 2 q_des; a stop 1e-6 before that ends the motion there, and
-    it sets out anew without speed."""
+    """q = q_des (1 - cos wt) turns at 2 q_des; a stop 1e-6 before that ends the motion.
+
+    The motion continues from rest.
+    """
     depth, omega = 1e-6, 5.0
     starts = {
         "q_start[1]": 0.0,
@@ -273,7 +275,7 @@ def test_a_step_that_the_engine_cannot_integrate_is_warned_of(importer):
 
 
 def test_what_passes_no_stop_is_the_same_as_without_the_call(importer):
-    """Bit for bit, with located stops."""
+    """Results are bit-identical, with located stops."""
     starts = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0, "v_start[1]": 2.0}
     told, silent = importer(starts), importer(starts)
     rows = told.run(1.0, 2e-3)
@@ -282,7 +284,7 @@ def test_what_passes_no_stop_is_the_same_as_without_the_call(importer):
 
 
 def turning_point(solver, joint):
-    """The time at which a joint turns first, without stops, and where it does."""
+    """The time and the position at which a joint first turns without stops."""
     t, h, y = 0.0, 1e-3, solver.y
     new = solver.advanced(t, y, h, 4)
     while y[2 + joint] * new[2 + joint] > 0.0:
@@ -296,7 +298,7 @@ def turning_point(solver, joint):
 
 
 def short_stop(solver, joint, depth):
-    """The start value of a limit that a joint touches, this deep, where it would turn."""
+    """The start value of a limit that a joint passes by a given depth before it turns."""
     upwards = solver.y[2 + joint] > 0.0
     turn, q = turning_point(solver, joint)
     if upwards:
@@ -305,7 +307,7 @@ def short_stop(solver, joint, depth):
 
 
 def test_after_a_passed_stop_all_is_as_at_a_start_there(importer):
-    """Joints that rest and the rates follow from the state, as at any event."""
+    """Resting joints and rates follow from the state, as at any event."""
     starts = {
         "q_start[1]": 0.0,
         "q_start[2]": 0.0,
@@ -329,7 +331,7 @@ def test_after_a_passed_stop_all_is_as_at_a_start_there(importer):
 
 
 def test_the_rank_after_a_passed_stop_is_that_of_the_state_there(importer, fmus):
-    """All of the motion has a J+ of rank 1."""
+    """J+ has rank 1 during the whole motion."""
     starts = {"rcond": 0.9, "Kp[1]": 100.0, "Kp[2]": 100.0, "Kd[1]": 0.0, "Kd[2]": 0.0}
     turn, limit = short_stop(importer({**starts, "v_start[2]": 1.0}, control="task"), 1, 1e-6)
     starts |= {"v_start[2]": 1.0, **limit}
@@ -343,7 +345,7 @@ def test_the_rank_after_a_passed_stop_is_that_of_the_state_there(importer, fmus)
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_a_saved_state_knows_the_solvers_step(importer, fmi):
-    """Saved within the step, and between its end and the event."""
+    """It is saved within the step, and between its end and the event."""
     states = []
     for moment in ("never", "within", "asked"):
         solver = importer(TOUCH, fmi)
@@ -363,7 +365,7 @@ def test_a_saved_state_knows_the_solvers_step(importer, fmi):
 
 
 def moved(solver, other):
-    """Another instance in the state of one, by its bytes."""
+    """Another instance in the serialised state of one."""
     state = solver.getFMUState()
     copy = other.deserializeFMUState(bytes(solver.serializeFMUState(state)))
     solver.freeFMUState(state)
@@ -373,7 +375,7 @@ def moved(solver, other):
 
 
 def test_an_event_at_another_state_takes_no_passed_stop(importer):
-    """An importer that goes on, or sets the states itself, instead of entering event mode."""
+    """The importer continues, or sets the states itself, instead of entering event mode."""
     solver = importer(TOUCH)
     rows = solver.run(0.075, 5e-3, 0.075, 20)
     y = solver.advanced(0.075, rows[-1], 5e-3, 20)

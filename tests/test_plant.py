@@ -78,7 +78,7 @@ def test_default_run_follows_the_closed_form():
 
 
 def test_moving_target_is_followed():
-    """Feed-forward velocity and acceleration: no tracking error but the decaying first one."""
+    """With feed-forward velocity and acceleration, the only tracking error is the decaying initial one."""
     plant = default_arm()
     centre, radius, omega = np.array([0.15, 0.1]), 0.03, 4.0
     e0 = None
@@ -120,7 +120,7 @@ def test_torque_is_the_closed_form_of_the_two_link_arm():
 
 
 def test_external_torque_damping_and_effort_limits_act_as_in_the_closed_form():
-    """One Euler-small step from many states against the equations of motion in closed form."""
+    """One short step from many states agrees with the equations of motion."""
     text = URDF.read_text().replace("<limit ", '<dynamics damping="0.2"/><limit ')
     text = text.replace('effort="10"', 'effort="0.5"')
     plant = default_arm(text)
@@ -144,7 +144,7 @@ def test_external_torque_damping_and_effort_limits_act_as_in_the_closed_form():
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_jacobian_and_drift_against_finite_differences(name, request):
-    """J v and J̇ v as the controller uses them, from x(q) alone."""
+    """J v and J̇ v of the controller, from x(q) alone."""
     plant = arm(name, request)
     n = len(plant.q)
     rng = np.random.default_rng(3)
@@ -177,7 +177,7 @@ def test_jacobian_and_drift_against_finite_differences(name, request):
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_mass_matrix_and_nonlinear_effects_against_mujoco(name, request):
-    """Through τ: with J q̈ = a, the controller's τ is M q̈_cmd + h."""
+    """They enter τ: with J q̈ = a, the controller's τ is M q̈_cmd + h."""
     plant = arm(name, request)
     model = mujoco_model(request.getfixturevalue(name))
     data = mujoco.MjData(model)
@@ -201,7 +201,7 @@ def test_mass_matrix_and_nonlinear_effects_against_mujoco(name, request):
 
 
 def test_self_motion_comes_to_rest(request):
-    """Seven joints, three axes: with Kn the null-space velocity decays as exp(−Kn t)."""
+    """Seven joints have three task axes: with Kn the null-space velocity decays as exp(−Kn t)."""
     plant = arm("panda", request)
     assert plant.Kn == 10.0
     plant.x_des = plant.x
@@ -218,7 +218,7 @@ def test_self_motion_comes_to_rest(request):
 
 
 def stops_and_releases(h: float):
-    """The run into narrowed limits: each joint is stopped and released at both ends."""
+    """A run into narrowed limits, at both of which each joint is stopped and released."""
     plant = default_arm()
     plant.q_min, plant.q_max = [-0.2, 0.8], [0.8, 1.9]
     plant.q_start = [0.3, 1.3]
@@ -274,7 +274,7 @@ def test_unreachable_targets_and_singularities_never_fail(length):
 
 
 def test_a_joint_that_grazes_its_limit_at_the_fold_does_not_chatter(monkeypatch):
-    """Folded at both limits: joint 1 is released by −5e-24 rad/s² and back at once, for ever."""
+    """The arm is folded at both limits; −5e-24 rad/s² would release joint 1 and stop it at once, without end."""
     plant = default_arm()
     plant.q, plant.v = [np.pi, -3.1352186957606243], [0.0, -1.4880270052931837]
     plant.x_des = [-0.11596721002411503, -0.17468495304859388]
@@ -358,7 +358,7 @@ def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -
     ],
 )
 def test_a_matrix_without_an_inverse_discards_the_step(control, settings):
-    """The Panda's fingers are coupled; an exception of another kind ends the process of a Python FMU."""
+    """The Panda's fingers are coupled; another kind of exception would end the process of a Python FMU."""
     plant = model("panda", control).plant()
     vars(plant).update(settings)
     before = plant.q, plant.v
@@ -368,7 +368,7 @@ def test_a_matrix_without_an_inverse_discards_the_step(control, settings):
 
 
 def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
-    """Rounding would: TIAGo has a wrist that is light and much damped."""
+    """Rounding would move the light, strongly damped wrist of TIAGo."""
     plant = model("tiago").plant()
     assert max(plant.robot.damping) > 0.0
     q = list(plant.q)

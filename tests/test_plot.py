@@ -1,4 +1,4 @@
-"""The artists of a figure of runs, against the FMU's own samples and closed forms."""
+"""The artists of a figure of runs, against the FMU's samples and closed forms."""
 
 import math
 import re
@@ -158,7 +158,7 @@ def test_efforts_are_drawn_with_their_limits(fmu_path, tmp_path):
 
 
 def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path):
-    """As the FMU's output has them, limited to 9 N·m or not."""
+    """They equal the FMU's output, limited to 9 N·m or not."""
     fmu = build(tmp_path, chain_urdf("zz"), control="effort")
     (tmp_path / "in.csv").write_text("time,tau_cmd[1]\n0,1\n0.02,12\n0.04,-2\n")
     for limited in (False, True):
@@ -176,7 +176,7 @@ def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path):
 
 
 def test_targets_of_joints_are_dashed_lines(tmp_path):
-    """Each bag has its own, in view, told, and legible beside limits and efforts; on a page too."""
+    """Each bag's own target is visible, named, and legible next to limits and efforts, also on a page."""
     fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
     (tmp_path / "in.csv").write_text("time,q_des[1],q_des[2]\n0,0.8,1\n0.2,1.2,-0.1\n")
     bags = [tmp_path / "one", tmp_path / "two"]
@@ -215,7 +215,7 @@ def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path):
 
 
 def test_targets_of_many_joints_are_legible(tmp_path):
-    """They stand beside limits with long names, and efforts; their place is named once."""
+    """They are next to limits with long names and efforts; the legend has one entry for them."""
     fmu = build(tmp_path, chain_urdf("zyx" * 4, 0.1, low=-1.234, high=2.345), control="joint")
     bag, target = twodof.Bag(tmp_path / "bag", effort=True), {"q_des": 0.1}
     twodof.simulate(fmu, bag, stop_time=0.05, settings=target)
@@ -235,7 +235,7 @@ def test_a_bag_may_have_the_name_of_a_limit(default):
 
 
 def test_changes_are_where_the_master_makes_them(changing):
-    """Distances by the FMU's own x and the inputs of its samples; the closed form by its x."""
+    """Distances follow from the FMU's x and the samples' inputs, and the closed form from its x."""
     figure = plot(changing.bag)
     found = panels(figure)
     assert found.error is not None
@@ -293,7 +293,7 @@ def test_the_closed_form_says_what_it_leaves_out(urdf, settings, label, tmp_path
 
 @pytest.mark.parametrize(("joints", "control"), [("z", "task"), ("zz", "pose")])
 def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(joints, control, tmp_path):
-    """One joint for two axes; two joints for these and an orientation."""
+    """One joint has two axes; two joints have two axes and an orientation."""
     start = (0.3, 0.5)[: len(joints)]
     fmu = build(tmp_path, chain_urdf(joints), axes="xy", q_start=start, control=control)
     recording = record(tmp_path / "bag", fmu, stop_time=0.5, settings={"x_des": (0.3, 0.3)})
@@ -357,7 +357,7 @@ def test_ticks_of_what_does_not_move_differ(default, at):
 
 
 def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains):
-    """Each by one look in all panels."""
+    """Each has one line style in all panels."""
     figure = plot(*(recording.bag for recording in gains.values()))
     names = ["Kp = 20 s⁻²", "Kp = 50 s⁻²", "Kp = 400 s⁻²"]
     assert key_of(figure) == names

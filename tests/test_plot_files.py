@@ -98,7 +98,7 @@ def test_numbers_too_large_for_an_axis_are_gaps(default, tmp_path, kind):
 
 
 def test_noise_in_a_long_bag_keeps_its_extremes(default, tmp_path):
-    """In each of 500 pixels across; and files stay small."""
+    """They are kept in each of 500 pixels of width, and files stay small."""
     n = 120_000
     noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))
     noise[41_152] = 0.3, -0.2  # a spike of one sample
@@ -125,7 +125,7 @@ def test_noise_in_a_long_bag_keeps_its_extremes(default, tmp_path):
 
 
 def test_a_long_path_keeps_its_corners(default, tmp_path):
-    """A square in which the end effector rests long: no corner is cut."""
+    """The path is a square in which the end effector rests long."""
     corners = np.array([(0.1, 0.1), (0.2, 0.1), (0.2, 0.15), (0.1, 0.15), (0.1, 0.1)])
     side = np.linspace(0.0, 1.0, 1250)[:, None]
     legs = [a + (b - a) * side for a, b in itertools.pairwise(corners)]
@@ -187,9 +187,9 @@ for kind in ("png", "svg", "pdf", "html"):
 
 
 def test_equal_bags_give_equal_files(gains, tmp_path):
-    """In another process, with other hashes, at another time; in which a figure is quick.
+    """Processes, hashes and times differ.
 
-    That is: nothing is imported for it that takes long.
+    Drawing imports nothing slow.
     """
     environment = {**ENVIRONMENT, "PYTHONHASHSEED": "1", "SOURCE_DATE_EPOCH": "1"}
     done = python("-c", PLOT, gains[20].bag, cwd=tmp_path, check=True, env=environment)
@@ -201,7 +201,7 @@ def test_equal_bags_give_equal_files(gains, tmp_path):
 
 
 def test_without_a_name_the_plot_has_that_of_the_bag(gains, tmp_path, monkeypatch):
-    """A plot of ours is replaced, and nothing else is."""
+    """Only a plot of this package is replaced."""
     monkeypatch.chdir(tmp_path)
     tracks = read_tracks([gains[50].bag])
     assert save(drawing(tracks)) == Path("Kp50.png")
@@ -272,7 +272,7 @@ for environment, backend in json.loads(sys.argv[2]):
 
 
 def test_a_window_opens_where_there_is_a_display(default, tmp_path):
-    """An X or a Wayland one; and not by a backend for files, or one that is not there."""
+    """The display is X or Wayland; backends for files, or missing ones, open none."""
     (tmp_path / "windows.py").write_text(BACKEND.format(framework="test"))
     (tmp_path / "files.py").write_text(BACKEND.format(framework=None))
     cases = [

@@ -19,7 +19,7 @@ from twodof.plots.track import read_tracks
 
 
 def traces(figure: dict[str, Any], joint: str, kind: str) -> list[np.ndarray]:
-    """Curves of a figure on a page, N × 2 each: bytes of little-endian doubles."""
+    """Curves of a figure on a page, N × 2 each, from little-endian doubles."""
 
     def numbers(packed: dict[str, str]) -> np.ndarray:
         assert packed["dtype"] == "f8"
@@ -33,7 +33,7 @@ def traces(figure: dict[str, Any], joint: str, kind: str) -> list[np.ndarray]:
 
 
 def test_a_page_has_the_curves_of_the_bags(gains):
-    """As plotly itself takes them, which refuses what it does not know."""
+    """plotly itself reads them; it refuses unknown properties."""
     tracks = read_tracks([gains[20].bag, gains[50].bag])
     time, view = over_time(tracks), *in_workspace(tracks)
     for figure in (time, view):
@@ -49,7 +49,7 @@ def test_a_page_has_the_curves_of_the_bags(gains):
 
 
 def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(default, tmp_path):
-    """It keeps extremes, and jumps that are none, of one sample, in a curve that swings further."""
+    """It keeps extremes, and a jump of one sample in a curve with larger swings."""
     n, jumps = 360_000, np.array([11_113, 130_077, 347_042])
     noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))
     noise[41_152] = 0.3, -0.2  # a spike of one sample
@@ -88,7 +88,7 @@ class Links(HTMLParser):
 
 
 def test_a_page_needs_no_network(default, tmp_path):
-    """And names in it are text, whatever they are."""
+    """Names in it are shown as text."""
     bag = tmp_path / "<script src=x> & co"
     shutil.copytree(default.bag, bag)
     page = save(drawing(read_tracks([bag])), tmp_path / "a.html").read_text("utf-8")
@@ -116,7 +116,7 @@ def chromium():
 
 
 def test_a_page_answers(gains, chromium, tmp_path):
-    """Boxes switch joints and bags in all figures, the cursor tells the values of all panels."""
+    """Boxes switch joints and bags in all figures, and the cursor shows the values of all panels."""
     tracks = read_tracks([gains[20].bag, gains[50].bag])
     page = save(drawing(tracks), tmp_path / "a.html")
     said: list[str] = []
@@ -156,7 +156,7 @@ def test_a_page_answers(gains, chromium, tmp_path):
 
 
 def test_buttons_of_a_page_cover_no_heading(default, chromium, tmp_path):
-    """Nor on a phone, where they are always shown."""
+    """This includes phones, where they are always visible."""
     page = save(drawing(read_tracks([default.bag])), tmp_path / "a.html")
     phone = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
     with chromium.new_context(offline=True, **phone) as context:

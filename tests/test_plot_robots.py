@@ -36,7 +36,7 @@ def seen(folder: Path, urdf: str, names: Sequence[str], *motion: Any, frame: str
 
 
 def kinematics(urdf: str, frame: str, names: Sequence[str], q: np.ndarray) -> np.ndarray:
-    """Path of a frame by Pinocchio straight from the URDF, N × 3."""
+    """Path of a frame by Pinocchio directly from the URDF, N × 3."""
     model = pin.buildModelFromXML(urdf)
     data = model.createData()
     path = []
@@ -76,7 +76,7 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5, tmp_path):
 
 
 def test_a_single_joint_has_its_position_above_its_velocity(tmp_path):
-    """The target is a height; across, the end effector may be anywhere."""
+    """The target is a height; the end effector may be anywhere across it."""
     fmu = build(tmp_path, chain_urdf("z"), axes="y", q_start=(-0.3,))
     recording = record(tmp_path / "bag", fmu, stop_time=1.0, settings={"x_des": 0.2})
     figure = plot(recording.bag)
@@ -117,7 +117,7 @@ PLANES = {
 
 @pytest.mark.parametrize(("axes", "expected"), PLANES.items(), ids=list(PLANES))
 def test_motion_in_a_plane_is_seen_in_that_plane(axes, expected, tmp_path):
-    """With the circle that it cannot leave, if all of its joints turn."""
+    """The reach circle is drawn if all joints rotate."""
     names = [f"j{i + 1}" for i in range(len(axes))]
     (view,) = panels(seen(tmp_path, chain_urdf(axes), names, *waves(len(axes)))).views
     plane, reach = expected
@@ -131,7 +131,7 @@ def test_motion_in_a_plane_is_seen_in_that_plane(axes, expected, tmp_path):
 
 
 def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path):
-    """Links of 0.24 × 0.32 × 0.1 m whose joints turn about z: it is seen from above alone."""
+    """Joints of links of 0.24 × 0.32 × 0.1 m rotate about z: only the top view is drawn."""
     urdf = chain_urdf("zz").replace('<origin xyz="0.4 0 0"/>', '<origin xyz="0.24 0.32 0.1"/>')
     above, beside = panels(seen(tmp_path, urdf, ["j1", "j2"], *waves(2))).views
     np.testing.assert_allclose(np.hypot(*only(above, "reach 0.8 m").T), 0.8)
@@ -148,7 +148,7 @@ def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path):
 
 @pytest.mark.parametrize(("count", "low", "high"), [(16, 0.67, 1.41), (30, 0.67, 1.5)])
 def test_many_joints_fit_on_a_page(count, low, high, tmp_path):
-    """Sixteen in one column on one of A4, thirty on a screen."""
+    """Sixteen fit in one column on an A4 page, thirty on a screen."""
     names = [f"j{i + 1}" for i in range(count)]
     figure = seen(tmp_path, chain_urdf("zy" * (count // 2), length=0.1), names, *waves(count))
     width, height = figure.get_size_inches()
@@ -197,7 +197,7 @@ def test_another_frame_needs_only_the_joints_that_move_it(foreign, ur5, tmp_path
 
 
 def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots, tmp_path):
-    """The Panda as it is: a finger mimics the other; and here its links have no masses."""
+    """One of the Panda's fingers mimics the other, and its links have no masses here."""
     urdf = bare((robots / "panda_description/urdf/panda.urdf").read_text())
     massless = re.sub("<inertial>.*?</inertial>", "", urdf, flags=re.S)
     names = [f"panda_{name}" for name in ("finger_joint1", "finger_joint2")]
@@ -231,7 +231,7 @@ def test_a_bag_of_one_sample_is_a_point(foreign, ur5, tmp_path):
 
 
 def test_a_urdf_may_replace_that_of_the_bag(default, tmp_path):
-    """Longer links, as after a calibration; limits and target remain those of the run."""
+    """Its links are longer, as after a calibration; limits and target remain those of the run."""
     urdf = ARM.read_text()
     longer = urdf.replace('<origin xyz="0.15 0 0"', '<origin xyz="0.3 0 0"')
     (tmp_path / "longer.urdf").write_text(longer.replace("3.141592653589793", "1.5"))
@@ -245,7 +245,7 @@ def test_a_urdf_may_replace_that_of_the_bag(default, tmp_path):
 
 
 def test_a_xacro_file_may_be_the_robot_of_a_bag(default, tmp_path):
-    """Expanded as it is where an FMU is built of it."""
+    """It is expanded as for a build."""
     urdf = ARM.read_text()
     named = urdf.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     length = '<xacro:property name="length" value="${0.1 * 3}"/><link name="world"/>'
@@ -266,7 +266,7 @@ def test_for_another_frame_there_is_no_target(default):
 
 
 def test_a_recovered_bag_with_a_gap(default):
-    """Samples 100 to 199 are lost: the rest is where it was."""
+    """Samples 100 to 199 are lost; the others keep their times."""
     run = twodof.read_bag(default.bag)
     kept = np.r_[0:100, 200:501]
     short = replace(run, stamps=run.stamps[kept], q=run.q[kept], v=run.v[kept])
@@ -311,7 +311,7 @@ def test_a_urdf_that_is_wrong_is_named(urdf, options, message, tmp_path):
 
 @pytest.mark.filterwarnings("error")
 def test_a_joint_at_infinity_is_nowhere(tmp_path):
-    """It turns, slides or is followed: a gap in the path and on the replay, no warning."""
+    """A revolute, prismatic or mimicked joint leaves a gap in the path and on the replay, without a warning."""
     (tmp_path / "arm.urdf").write_text(chain_urdf("zXy"))
     t, q, v = waves(3)
     q[3:6] = np.diag([np.inf, -np.inf, np.inf])

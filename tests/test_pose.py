@@ -59,7 +59,7 @@ def starts(fmu: twodof.Fmu, group: str) -> np.ndarray:
 
 
 def orientations(run: twodof.Experiment) -> list[Rotation]:
-    """By Pinocchio, at the samples' joint positions."""
+    """Orientations by Pinocchio at the samples' joint positions."""
     assert run.fmu.urdf is not None
     robot = load_robot(run.fmu.urdf, run.fmu.frame, "xyz")
     data, G = robot.model.createData(), robot.coupling
@@ -72,7 +72,7 @@ def orientations(run: twodof.Experiment) -> list[Rotation]:
 
 
 def errors_after_a_turn(fmu: twodof.Fmu, turn: np.ndarray, sign: float = 1.0) -> np.ndarray:
-    """log(R_des Rᵀ) over 0.5 s, the target turned from the start by a rotation vector."""
+    """log(R_des Rᵀ) over 0.5 s; at the start the target is rotated by a rotation vector."""
     target = Rotation.from_rotvec(turn) * Rotation.from_quat(starts(fmu, "quat_des"))
     settings = {"quat_des": tuple(sign * target.as_quat()), "Kp_rot": 30.0, "Kd_rot": 7.0, **TIGHT}
     settings |= {"q_min[6]": -7.0, "q_max[6]": 7.0}
@@ -98,7 +98,7 @@ def closed_form(turn: np.ndarray) -> np.ndarray:
 @FLAVOURS
 @pytest.mark.parametrize("name", ["ur10", "panda"])
 def test_a_pose_target_against_an_integration_of_its_own(fmus, name: str, native: bool) -> None:
-    """With the Panda's damping, and its fingers, of which one follows the other."""
+    """The Panda has its damping, and fingers of which one mimics the other."""
     fmu = fmus[name, native]
     goal = Rotation.from_rotvec([0.4, 0.3, -0.5]) * Rotation.from_quat(starts(fmu, "quat_des"))
     place = starts(fmu, "x_des") + np.array([0.05, -0.04, -0.06])
@@ -228,7 +228,7 @@ def test_few_joints_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixtu
 
 @pytest.fixture(scope="module")
 def bag(fmus, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose target orientation, not of length 1, changes after 0.1 s."""
+    """A run whose target orientation, not a unit quaternion, changes after 0.1 s."""
     folder = tmp_path_factory.mktemp("bag")
     run = twodof.experiment(fmus["ur10", True], stop_time=0.2)
     change: dict = {"quat_des": (0.0, 2.0, 0.0, 0.0), "x_des": (0.5, 0.2, 0.7)}
@@ -317,7 +317,7 @@ time.sleep(60)
 def test_a_pose_on_the_network_is_the_target(
     fmus, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four come: one is in another frame, one has no orientation, one is not finite."""
+    """Four arrive: one is in another frame, one has no orientation, one is not finite."""
     from twodof.ros.publisher import Publisher
 
     monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))

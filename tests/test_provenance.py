@@ -70,7 +70,7 @@ def by_a_thinned_loop(fmu: Path, bag: Path, samples: Collector) -> None:
 
 
 def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
-    """Send what the page's controls do, one order after some news; the recording begins midway."""
+    """Send the requests of the page's controls between updates; the recording starts midway."""
     run = twodof.experiment(fmu, stop_time=math.inf)
     loop = Loop(run, bag=str(bag))
     loop.viewers = 1
@@ -170,7 +170,7 @@ def test_so_it_is_after_a_kill_up_to_the_last_flush(native_path, tmp_path):
 
 
 def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(native_path, tmp_path):
-    """In a bag whose run.json was lost, and where there were more changes than it has room for."""
+    """The run.json is lost, or had no room for all changes."""
     samples = Collector()
     run = twodof.experiment(native_path, stop_time=STEPS / 100)
     steps = twodof.samples(run)
@@ -207,7 +207,7 @@ def _renamed_root(urdf: Path) -> Path:
 
 
 def test_what_is_not_known_is_not_shown(native_path, tmp_path):
-    """The file of the changes was full: no distance is shown after its end."""
+    """The file of changes is full: no distance is shown after its end."""
     bag = tmp_path / "bag"
     by_sending(native_path, bag, Collector())
     text = (bag / "run.json").read_text().strip()
@@ -283,7 +283,7 @@ def test_provenance_has_each_change_of_an_input_that_a_loop_sends(native_path, t
 
 
 def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(native_path, tmp_path):
-    """At each flush, so that they survive the death of the process."""
+    """They are written at each flush, so that they survive the death of the process."""
     run = twodof.experiment(native_path, stop_time=math.inf)
     steps = twodof.samples(run)
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
@@ -318,7 +318,7 @@ def test_provenance_says_where_it_was_full(run, tmp_path, monkeypatch):
 
 
 def test_changes_beyond_what_a_reader_holds_are_not_known(run, tmp_path):
-    """Each of 4000 inputs changes once: together 8 million values in effect, of a file of 100 kB."""
+    """Each of 4000 inputs changes once: a file of 100 kB has 8 million values in effect."""
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(5):
             bag.write(sample(run, k))

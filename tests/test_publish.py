@@ -1,7 +1,7 @@
-"""A published run, received and commanded by a node on Fast DDS with an IDL of its own.
+"""A published run, received and commanded by a node on Fast DDS with its own IDL.
 
-Truth is the bag that is recorded at the same time, read by the MCAP project's reader. All stays on
-the loopback interface, or in network namespaces that lead nowhere.
+The reference is the bag recorded at the same time, read by the MCAP project's reader. All traffic stays on the loopback
+interface, or in network namespaces without a route out.
 """
 
 import json
@@ -44,7 +44,7 @@ TYPES = dict(
 
 
 def test_another_makers_dds_hears_every_field_of_the_bag(native_path, tmp_path, number, listen, length):
-    """Under the names, types and type hashes of ROS 2, stamped by the wall clock."""
+    """Names, types and type hashes are those of ROS 2; stamps are those of the wall clock."""
     seconds, before = length(60, 2), 4  # in which a busy machine finds the node
     node = listen(*STREAMS, *LATCHED)
     bag = tmp_path / "bag"
@@ -135,7 +135,7 @@ def test_a_point_is_the_target_within_two_steps(native_path, tmp_path, number, l
 
 
 def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(native_path, tmp_path, number, listen):
-    """The robot is stopped, and follows the next target that it can; one warning a kind."""
+    """The robot stops, and follows the next valid target; there is one warning for each kind."""
     node = listen("/joint_states", "/target", *COMMANDS)
     options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
     with published(number, native_path, *options) as process:
@@ -252,7 +252,7 @@ def packets(process: subprocess.Popen[str]) -> int:
     ],
 )
 def test_range(native_path, number, listen, options, variables, reach, local, outside):
-    """A node of ROS 2's default range hears the run, and packets leave the host, or not."""
+    """A node with ROS 2's default range receives the run; packets leave the host, or not."""
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     inside = isolated(CABLE)
     with published(number, native_path, *options, inside=inside, **variables) as process:
@@ -360,7 +360,7 @@ print(memory.growth)
 @pytest.mark.long
 @pytest.mark.needs("linux")
 def test_an_hour_has_flat_memory(native_path, number, listen, length):
-    """Seconds without pace; in full, an hour in real time."""
+    """The run has no pace; in full, it takes an hour in real time."""
     steps = length(360_000, 5_000)
     listen("/joint_states", "/tf", "/robot_description")
     arguments, paced = ["-c", MEMORY, native_path, str(steps)], "paced" if steps == 360_000 else ""
@@ -438,7 +438,7 @@ def test_options_beside_an_experiment_are_refused(native_path):
 
 
 def test_a_publisher_tells_each_run_what_holds_for_it(native_path, number, listen):
-    """Also the second, whose robot may be another."""
+    """The second run may have another robot."""
     publisher = twodof.Publisher(network_of_environment(environment(number)), scene=True)
     run = twodof.experiment(native_path, stop_time=0.02)
     twodof.publish(run, publisher=publisher)
@@ -452,7 +452,7 @@ def test_a_publisher_tells_each_run_what_holds_for_it(native_path, number, liste
 
 
 def test_robots_whose_fmus_would_be_one_file_are_refused(tmp_path, monkeypatch, capsys):
-    """The second was run as both, under the name of the first."""
+    """Otherwise the second would run as both."""
     monkeypatch.chdir(tmp_path)
     shipped = data_file("urdf", "2dof.urdf").read_text()
     for maker, mass in (("one", "0.18"), ("other", "9.18")):

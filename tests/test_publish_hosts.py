@@ -95,7 +95,7 @@ def other_host(process: subprocess.Popen[str]) -> Iterator[int]:
 def test_other_hosts_are_obeyed_where_it_says_so_alone(
     native_path, tmp_path, number, options, variables, said, open_to
 ):
-    """One that announces itself to each of the run's ports, listens and commands."""
+    """One announces itself to each of the run's ports, listens and commands."""
     bag, inside = tmp_path / "bag", isolated(CABLE)
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     options = [*options, "-o", str(bag)]
@@ -112,7 +112,7 @@ def test_other_hosts_are_obeyed_where_it_says_so_alone(
 
 
 def test_nodes_that_command_are_recorded_and_two_at_once_reported(native_path, tmp_path, number, listen):
-    """Each once, by what DDS tells of its participant."""
+    """Each is recorded once, by DDS's facts about its participant."""
     bag = tmp_path / "bag"
     one, two = listen("/target_command"), listen("/target_command")
     with published(number, native_path, "-o", str(bag)) as process:
@@ -158,7 +158,7 @@ def test_a_host_whose_own_name_nothing_resolves() -> None:
 
 
 def test_a_node_that_leaves_at_once_is_recorded(native_path, number):
-    """Before its command is read, DDS has forgotten its writer."""
+    """DDS has forgotten its writer before its command is read."""
     run, _shared = twodof.experiment(native_path), open_domain(Network(number))
     own, quality = DomainParticipant(number), dds_qos(STREAM, POINT)
     reader, commanders = DataReader(own, dds_topic(own, "/target_command", POINT), quality), Commanders(own, run)

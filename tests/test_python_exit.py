@@ -51,7 +51,7 @@ def in_fmpy(folder: Path, guid: str, _: Path) -> tuple[list[str], dict[str, str]
 
 
 def from_c(folder: Path, guid: str, scratch: Path) -> tuple[list[str], dict[str, str]]:
-    """A C program with libpython preloaded, as docs/fmi-tools.md has it."""
+    """A C program with libpython preloaded, as in docs/fmi-tools.md."""
     libpython = Path(sysconfig.get_config_var("LIBDIR"), sysconfig.get_config_var("INSTSONAME") or "")
     if not libpython.is_file():
         missing("libpython")

@@ -21,7 +21,7 @@ GOAL = (0.9, 0.1, 0.3, 0.2)
 
 @pytest.fixture(scope="module")
 def ur5(tmp_path_factory):
-    """By its control."""
+    """FMUs of the UR5 by control."""
     folder = tmp_path_factory.mktemp("ur5")
     return {
         control: twodof.build_fmu(
@@ -127,7 +127,7 @@ def test_metrics_of_a_pose_are_those_of_its_samples(ur5, tmp_path):
 
 
 def test_joint_control_settles_too(ur5):
-    """Each joint as e'' + Kd e' + Kp e = 0, critically damped: e = e0 (1 + 5 t) exp(-5 t)."""
+    """Each joint obeys e'' + Kd e' + Kp e = 0, critically damped: e = e0 (1 + 5 t) exp(-5 t)."""
     settings = {"q_des": (0.3, -1.0, 1.2, 0.4, -0.8, 0.5), "Kd": 10.0}
     (row,) = twodof.sweep(ur5["joint"], grid={"Kp": [25.0]}, settings=settings).to_dict("records")
     t = np.arange(501) * 0.01
@@ -159,7 +159,7 @@ def test_no_run_beyond_the_limits_is_best(ur5, tmp_path, capsys):
 
 
 def test_what_rounding_tells_apart_is_equal(native_path, tmp_path, capsys):
-    """The tolerance's last bits change nothing: no run of these is better than another."""
+    """These values of rcond change the runs by rounding at most."""
     grid = ["--grid", "rcond=0.001:0.002:3", "--stop-time", "0.3", "-o", str(tmp_path / "s")]
     assert main(["sweep", str(native_path), *grid]) == 0
     assert "\nno single best run: 3 are equal up to rounding\n" in capsys.readouterr().out
@@ -185,7 +185,7 @@ def test_places_are_those_of_the_values(values, expected):
 
 
 def test_a_cost_ranks_the_runs(native_path, tmp_path, capsys):
-    """Against pandas' own expressions."""
+    """The reference is pandas' own expressions."""
     folder, cost = str(tmp_path / "s"), "settling + 0.1*peak_effort"
     grid = ["--grid", "Kp=20:200:4", "--grid", "Kd=10:30:2", "--stop-time", "2"]
     assert main(["sweep", str(native_path), *grid, "-o", folder, "--cost", cost, "--json"]) == 0

@@ -1,7 +1,6 @@
 """Bags with malicious records: refused in one line, or read correctly.
 
-MCAP files are made record by record after the specification. What they may cost in time and memory
-is tested in test_hostile_bags.py.
+MCAP files are made record by record by the specification. test_hostile_bags.py tests time and memory.
 """
 
 import sqlite3
@@ -160,7 +159,7 @@ DATABASES = {
 
 @pytest.mark.parametrize(("script", "reason"), DATABASES.values(), ids=DATABASES)
 def test_hostile_database_is_refused(bag, script, reason, capsys):
-    """A database as rosbag2 writes it, changed by some statements."""
+    """It is a database of rosbag2, changed by some statements."""
     with sqlite3.connect(bag / "bag.db3") as database:
         database.executescript(
             f"BEGIN; CREATE TABLE topics {TOPICS}, offered_qos_profiles TEXT);"
@@ -176,7 +175,7 @@ def test_hostile_database_is_refused(bag, script, reason, capsys):
 
 
 def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
-    """One file alone has it in its metadata, which a folder has in run.json."""
+    """A single file has in its metadata the provenance that a folder has in run.json."""
     content = '{"format":1,"fmu":{}}' + " " * 32 * 1024**2
     entries = texts("run.json", content)
     file = tmp_path / "one.mcap"
@@ -187,7 +186,7 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
 
 
 def test_mcap_of_records_that_are_all_alike_is_not_read_to_its_end(bag):
-    """Each of its chunks is a million empty messages, packed into 3 kB."""
+    """Each of its chunks has a million empty messages in 3 kB."""
     million = message(b"") * 1_000_000
     packed = chunk(zstandard.compress(million), len(million), "zstd")
     file = bag / "bag.mcap"
@@ -217,9 +216,9 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize(("what", "compression"), [("an arm", "lz4"), ("a humanoid", "zstd"), ("a heartbeat", "zstd")])
 def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path, what, compression):
-    """At the best level, in chunks of 4 MiB, without the index that tools write between them.
+    """It has the best compression, chunks of 4 MiB, and no index between them.
 
-    That is as small as it gets; each of its chunks pays for itself, so a day of them does.
+    No honest file is smaller; each chunk adds enough to the read budget, so a file of a day is read.
     """
     data = AT_REST[what]
     stamps = [START * SECOND + k * PERIOD for k in range(4 * 1024**2 // (31 + len(data(0))))]

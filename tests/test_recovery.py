@@ -1,4 +1,4 @@
-"""Bags whose writer died: the messages that are saved, and the recovered bag."""
+"""Bags whose writer died: the saved messages, and the recovered bag."""
 
 import errno
 import os
@@ -52,7 +52,7 @@ PAGE = 4096  # bytes, of SQLite
 
 
 def streamed(file: Path) -> int:
-    """Messages that the MCAP project's own reader gets out of a file that ends anywhere."""
+    """Messages that the MCAP project's reader reads from a file that ends at any byte."""
     count = 0
     with file.open("rb") as stream:
         try:
@@ -69,7 +69,7 @@ def streamed(file: Path) -> int:
 @pytest.mark.long
 @both_storages
 def test_killed_run_loses_a_second_at_most(native_path, tmp_path, storage, length):
-    """The bag has the time in which the run was recorded."""
+    """The bag has the time at which the run was recorded."""
     options = ["--stamp-start", str(START), "--storage", storage]
     undisturbed = tmp_path / "undisturbed"
     assert main(["run", str(native_path), "-o", str(undisturbed), "--stop-time=60", *options]) == 0
@@ -134,7 +134,7 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run, tmp_path):
 
 @pytest.mark.parametrize("part", [0.95, 0.5])
 def test_sqlite3_file_without_its_end_keeps_what_comes_before(run, tmp_path, part):
-    """The kept part is what SQLite itself reads once its header has the right number of pages."""
+    """The reference is SQLite, given a header with the right number of pages."""
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
         for k in range(3000):
@@ -185,7 +185,7 @@ def test_a_bag_of_which_nothing_can_be_read_stays(run, tmp_path, capsys):
 
 @pytest.mark.parametrize("named", ["", "a file", "nothing"])
 def test_sqlite3_transaction_that_was_cut_is_rolled_back(run, tmp_path, named):
-    """Also where its journal names that of several databases, which SQLite would delete."""
+    """Its journal may name a super-journal of several databases, which SQLite would delete."""
     bag = unfinished(tmp_path, run, "sqlite3", 200)
     file = bag / "bag.db3"
     committed = len(read_with_sqlite3(bag))
@@ -219,7 +219,7 @@ def test_sqlite3_transaction_that_was_cut_is_rolled_back(run, tmp_path, named):
 
 
 def super_journal(path: Path) -> bytes:
-    """Return the end of the journal of a transaction over several databases, from SQLite's pager.c."""
+    """Return the end of the journal of a transaction over several databases, by SQLite's pager.c."""
     name = os.fsencode(path)
     magic = bytes.fromhex("d9d505f920a163d7")
     return struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name)) + magic
@@ -254,7 +254,7 @@ DEFINITION = "# a comment\nfloat64[] readings\nstring unit\n"
 
 @pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.STORAGE])
 def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path, compression):
-    """Two files, as of a recorder that splits; the last lacks its end."""
+    """A recorder has split it into two files, the last of which lacks its end."""
     from twodof.ros.messages import LATCHED
 
     text = STORE.types["std_msgs/msg/String"]
@@ -293,7 +293,7 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path, compre
 
 
 def test_no_more_profiles_are_read_than_take_no_time(tmp_path, monkeypatch):
-    """Each topic has a profile of its own; YAML is slow."""
+    """Each topic has its own profile in YAML, which is slow to parse."""
     (tmp_path / "bag").mkdir()
     profiles = ["- {depth: [" + "1," * 300 + f"]}}#{i:02}" for i in range(50)]
     channels = [channel(i, f"/t{i}", qos) for i, qos in enumerate(profiles)]
@@ -440,7 +440,7 @@ for last, bag in enumerate(bags):
 
 
 def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(run, tmp_path):
-    """Its changes to folders, one after the other; the last of these have not so many."""
+    """It is killed at each of its changes to folders."""
     living = unfinished(tmp_path, run, "mcap", 200)
     before = content(living)
     bags = [tmp_path / str(last) / "bag" for last in range(9)]
@@ -480,7 +480,7 @@ def test_recovery_that_cannot_rename_leaves_the_bag_as_it_was(run, tmp_path, fai
 
 
 def test_bag_that_is_being_recovered_is_left_alone(run, tmp_path, monkeypatch):
-    """By another recovery and by a run that would overwrite it, at any moment."""
+    """Another recovery and a run with --overwrite refuse it at any moment."""
     bag = unfinished(tmp_path, run, "mcap", 10)
     rename, said = os.rename, []
 

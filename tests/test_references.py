@@ -44,7 +44,7 @@ def packed(files: dict[str, bytes], path: Path) -> Path:
 
 
 def rows(path: Path, *tools: str) -> dict[str, checking.Row]:
-    """The rows of references alone."""
+    """Only the rows of references."""
     fmu = load_any_fmu(path)
     return {row.name: row for row in checking._tried(fmu, checking._runs(fmu, tools))}
 
@@ -106,7 +106,7 @@ Changed = Callable[[str, str, str], Path]
 
 @pytest.fixture
 def changed(built: Path, tmp_path: Path) -> Changed:
-    """An FMU in whose source the first match of a pattern, behind marks, has 1e-6 more."""
+    """An FMU whose source has 1e-6 added to the first match of a pattern after some marks."""
 
     def change(file: str, mark: str, pattern: str) -> Path:
         files = members(built)
@@ -146,7 +146,7 @@ def test_a_constant_that_is_off_by_a_millionth_fails(changed: Changed, file: str
 
 
 def test_a_compiler_of_another_maker_leaves_it_within_the_tolerance(changed: Changed) -> None:
-    """The control of the test above: the same way with a change that does nothing."""
+    """It is the control of the test above: the same procedure with a change that has no effect."""
     found = rows(changed("mechanism.c", "void effort_bounds(|{", NUMBER))
     assert {row.outcome for row in found.values()} == {"passed"}, found
 
@@ -198,7 +198,7 @@ def test_damaged_references_fail_their_row(
 
 
 def test_an_experiment_may_have_any_name_and_needs_results(built: Path, tmp_path: Path) -> None:
-    """A name that reads like the row of a tool; results at the start alone are no results."""
+    """A name may resemble a tool's row; results at the start alone do not count."""
     files = members(built)
     experiments, results = f"{FOLDER}references.exp", f"{FOLDER}move-ref.csv"
     files[experiments] = files[experiments].replace(b'name="push"', b'name="push with fmpy"')

@@ -56,7 +56,7 @@ def description(
     causality: str = "output",
     head: str = "",
 ) -> str:
-    """A modelDescription.xml of another maker, as small as it may be."""
+    """A minimal third-party modelDescription.xml."""
     variables = "".join(
         f'<ScalarVariable name="{name}" valueReference="{i}" causality="{causality}"'
         ' variability="continuous"><Real/></ScalarVariable>'
@@ -95,19 +95,19 @@ FMI3 = (
 
 
 def damaged(content: bytes) -> bytes:
-    """A zip in which the compressed data of the description is not what deflate writes."""
+    """A zip archive with invalid compressed data of the description."""
     at = content.index(b"modelDescription.xml") + len("modelDescription.xml")
     return content[:at] + b"\xff" * 40 + content[at + 40 :]
 
 
 def swollen(content: bytes) -> bytes:
-    """A zip whose directory says that each entry unzips to 4 GB."""
+    """A zip archive whose directory states 4 GB for each entry."""
     entry = re.compile(rb"(PK\x01\x02.{20})....", re.DOTALL)
     return entry.sub(lambda match: match[1] + b"\xfe\xff\xff\xff", content)
 
 
 def encrypted(content: bytes) -> bytes:
-    """A zip whose entries say that they are encrypted."""
+    """A zip archive whose entries are marked as encrypted."""
     head = re.compile(rb"(PK\x03\x04..|PK\x01\x02....)\x00", re.DOTALL)
     return head.sub(lambda match: match[1] + b"\x01", content)
 
@@ -359,7 +359,7 @@ def test_damaged_default_fmu_is_built_again(folder, fmu_path, capfd):
 
 
 def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(folder, native_path, capfd):
-    """Also where there are others; what `run` could not do is not suggested."""
+    """There may be other FMUs; only those that `run` accepts are suggested."""
     assert main(["build", "--control", "effort", "--no-meshes", "-o", "TwoDof.fmu"]) == 0
     before = (folder / "TwoDof.fmu").read_bytes()
     shutil.copy(native_path, folder / "other.fmu")
@@ -371,7 +371,7 @@ def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(folder, na
 
 
 def test_a_run_replaces_no_file_that_is_not_its_own(folder, capfd):
-    """Neither notes nor an FMU of another state of the URDF, unless it is told to."""
+    """Without --overwrite it replaces neither notes nor an FMU of another version of the URDF."""
     (folder / "robot.urdf").write_text(urdf())
     (folder / "robot.fmu").write_text("notes")
     run = ["run", "robot.urdf", "--stop-time", "0.1"]
@@ -391,7 +391,7 @@ def test_a_run_replaces_no_file_that_is_not_its_own(folder, capfd):
 
 @pytest.mark.parametrize("verb", ["run", "page", "sweep --grid Kp=1:2:2"])
 def test_the_only_fmu_of_a_folder_is_asked_for_by_name(verb, tmp_path, monkeypatch, capfd):
-    """Another robot's is neither run without its name nor replaced by the default arm's."""
+    """Another robot's FMU is not run without its name, nor replaced by the default arm's."""
     folder = tmp_path
     monkeypatch.chdir(folder)
     (folder / "robot.urdf").write_text(urdf())

@@ -78,7 +78,7 @@ def test_they_are_pinocchios(panda: str, tmp_path: Path, flavour: str) -> None:
 
 @pytest.mark.parametrize("native", [False, True])
 def test_a_bare_plant_has_those_that_are_asked_for(tmp_path: Path, native: bool) -> None:
-    """The textbook form of the two-link arm; derivatives and dependencies hold."""
+    """The reference is the textbook form of the two-link arm; derivatives and dependencies are right."""
     path = tmp_path / "arm.fmu"
     command = ["build", "-o", str(path), "--control", "effort", "--with", "M", "h", *["--native"] * native]
     assert main(command) == 0

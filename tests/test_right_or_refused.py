@@ -1,8 +1,7 @@
 """Steps across singularities and stops are right, compared with SciPy, or refused.
 
-The oracle integrates the equations of motion, written here with Pinocchio and NumPy, from one event
-to the next: SciPy's ``solve_ivp`` at a tight tolerance, with the joints at limits and the number of
-singular values that J⁺ takes fixed in between.
+The oracle integrates equations of motion written with Pinocchio and NumPy from event to event: SciPy's ``solve_ivp`` at
+a tight tolerance, between events with fixed joints at limits and a fixed rank of J⁺.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ class Regime(NamedTuple):
 
 
 class Oracle:
-    """The motion of a plant under the tutorial's clamp, event by event."""
+    """The motion of a plant under the clamp of the tutorial, event by event."""
 
     def __init__(self, plant: Plant, method: str = "DOP853", max_step: float = 1e-3) -> None:
         self.plant, self.method, self.max_step = plant, method, max_step
@@ -204,7 +203,7 @@ def test_no_joint_is_thrown_where_the_pseudo_inverse_jumps(case):
 
 
 def test_a_motion_to_and_fro_across_the_singularity_is_no_sliding():
-    """Ordinary gains whip joint 2 across the fold every 13 µs; a rank that is held there throws the arm by a radian."""
+    """Ordinary gains move joint 2 across the fold every 13 µs; holding the rank would move the arm by a radian."""
     plant = shipped(
         engine("twodof"),
         q_start=[np.pi, 0.237],
@@ -237,7 +236,7 @@ def test_a_motion_to_and_fro_across_the_singularity_gains_no_energy(h):
 
 @pytest.mark.parametrize("steps", [1, 2, 12])
 def test_gains_that_whip_the_arm_within_nanoseconds_are_right_or_refused_at_every_communication_step(steps):
-    """A start that is moved by 1e-12 rad moves the end by 4e-10: the motion is determined."""
+    """A change of the start by 1e-12 rad changes the end by 4e-10 rad: the motion is determined."""
     x_des, of, found = [-0.44590624212903474, -0.13071369390558008], engine("twodof"), []
     for rtol, parts in ((1e-10, 12), (1e-8, steps)):
         plant = shipped(of, x_des=x_des, Kp=[1e8] * 2, Kd=[1e4] * 2, rtol=rtol, atol=1e-3 * rtol)
@@ -262,7 +261,7 @@ GAINS = [(50.0, 40.0), (50.0, 10.0), (200.0, 20.0), (1000.0, 60.0), (1.0, 1.0), 
 
 
 def at_the_singularity(rng: np.random.Generator) -> dict[str, list[float]]:
-    """A stretched or folded arm, some turns of joint 2 away from the jump of J⁺ or on it."""
+    """A stretched or folded arm, with joint 2 at the jump of J⁺ or some angle away from it."""
     Kp, Kd = GAINS[rng.integers(len(GAINS))]
     q = [rng.uniform(-3.0, 3.0), rng.choice([0.0, 0.0, 3.1]) + rng.uniform(-0.1, 0.1)]
     return {
@@ -276,7 +275,7 @@ def at_the_singularity(rng: np.random.Generator) -> dict[str, list[float]]:
 
 @pytest.mark.long
 def test_short_steps_at_the_singularity_are_those_of_the_oracle(length):
-    """A millisecond each: over more of it the motion forgets where it came from."""
+    """Each takes a millisecond: over longer times the motion is chaotic."""
     rng, of, crossed = np.random.default_rng(5), engine("twodof"), 0
     for _ in range(length(600, 40)):
         plant = shipped(of, **at_the_singularity(rng), rtol=1e-9, atol=1e-12)
@@ -294,7 +293,7 @@ def test_short_steps_at_the_singularity_are_those_of_the_oracle(length):
 @pytest.mark.long
 @pytest.mark.parametrize("gains", [(50.0, 10.0), (200.0, 20.0), (5000.0, 71.0)])
 def test_motions_across_the_singularity_do_not_depend_on_the_communication_step(gains, length):
-    """Joints are whipped to and fro, and onto their limits, within microseconds: none may be held there."""
+    """Joints oscillate, and hit their limits, within microseconds: none may be held there."""
     rng, of, whips = np.random.default_rng(2), engine("twodof"), 0
     plant = shipped(of, Kp=[gains[0]] * 2, Kd=[gains[1]] * 2)
     start, target = of.values(plant), [of.model.index("x_des") + k for k in (0, 1)]
@@ -331,7 +330,7 @@ def test_no_step_to_any_target_is_refused(gains, length):
 @pytest.mark.long
 @pytest.mark.parametrize("max_step", [0.001, 0.01, 0.05])
 def test_falls_between_narrow_stops_miss_none(max_step, length):
-    """The bare arm, whose joints are stopped and released at both ends, also within one step."""
+    """The joints of the bare arm are stopped and released at both ends, also within one step."""
     rng, of = np.random.default_rng(7), engine("twodof", "effort")
     stopped = 0
     for _ in range(length(300, 20)):
@@ -360,7 +359,7 @@ def test_falls_between_narrow_stops_miss_none(max_step, length):
 
 @pytest.mark.parametrize("max_step", [0.001, 0.01, 0.05])
 def test_a_limit_that_is_touched_between_two_ends_of_a_step_stops_the_joint(max_step):
-    """Joint 1 would be past its limit early in the step and back, joint 2 at the end of it."""
+    """Joint 1 would pass its limit early in the step and return; joint 2 passes its limit at the end."""
     rng, of = np.random.default_rng(8), engine("twodof", "effort")
     for _ in range(8):
         start = {"q_start": rng.uniform(-1.0, 1.0, 2).tolist()}
@@ -411,7 +410,7 @@ def test_a_release_that_ends_between_two_looks_at_the_effort_is_found_by_both_fl
 @pytest.mark.parametrize("friction", [True, False])
 @pytest.mark.parametrize("name", ["tiago", "tiago_dual"])
 def test_many_joints_at_stops_need_few_evaluations(name, friction, monkeypatch):
-    """Bare robots with hands, which fall onto rigid stops; 60 evaluations are the least a step."""
+    """Bare robots with hands fall onto rigid stops; a step needs at least 60 evaluations."""
     monkeypatch.setattr(integrator, "BUDGET", 950)
     plant = model(f"tiago_description/robots/{name}.urdf", "effort").plant()
     limits = list(zip(plant.q_min, plant.q_max))

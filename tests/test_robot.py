@@ -1,4 +1,4 @@
-"""URDFs: refusals with the culprit's name, and how accepted elements are read."""
+"""URDFs: refusals with the culprit's name, and the meaning of accepted elements."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def robot(*parts: str) -> str:
 
 
 def arm(*more: str, **changes: str) -> str:
-    """An arm of two joints, with parts of it replaced or added."""
+    """An arm of two joints, with replaced or added parts."""
     parts = {
         "base": link("base", ""),
         "upper": link("upper"),
@@ -232,7 +232,7 @@ def test_any_number_of_joints_that_is_not_refused_loads_in_two_gigabytes() -> No
 
 
 def angles(model: pin.Model, q: np.ndarray) -> np.ndarray:
-    """Pinocchio's own configuration, (cos, sin) where it has two numbers for an angle."""
+    """Pinocchio's configuration, (cos, sin) for an angle with two numbers."""
     own: list[float] = []
     for jnt, value in zip(list(model.joints)[1:], q):
         own.extend([value] if jnt.nq == 1 else [math.cos(value), math.sin(value)])
@@ -240,7 +240,7 @@ def angles(model: pin.Model, q: np.ndarray) -> np.ndarray:
 
 
 def assert_same_mechanism(loaded: Robot, urdf: str) -> None:
-    """Frames and mass matrix are those of Pinocchio's own loading of the URDF."""
+    """Assert that frames and mass matrix are those of Pinocchio's own loading of the URDF."""
     own = pin.buildModelFromXML(urdf)
     assert list(loaded.model.names) == list(own.names)
     data, own_data = loaded.model.createData(), own.createData()
@@ -385,7 +385,7 @@ def test_inertial_of_the_base_has_no_effect(inside: str, capfd: pytest.CaptureFi
 
 
 def test_numbers_may_have_spaces_around_them(capfd: pytest.CaptureFixture[str]) -> None:
-    """urdfdom would take them for 0."""
+    """urdfdom would read them as 0."""
     spaced = re.sub(r'(value|i..|xyz)="([^"]*)"', r'\1=" \2\n"', inertial(2.0, 0.3, 0.4, 0.5))
     plain = load_robot(arm(tip=link("tip", inertial(2.0, 0.3, 0.4, 0.5))), "tip", "xyz").model
     found = load_robot(arm(tip=link("tip", spaced), elbow=elbow(axis=" 0 0  1 ")), "tip", "xyz").model

@@ -68,7 +68,7 @@ def test_a_missing_tool_is_one_line_and_a_failure_in_ci(tmp_path):
 
 
 def test_the_seed_of_the_order_is_printed(tmp_path):
-    """And the same seed gives the same order."""
+    """The same seed gives the same order."""
     text = "import pytest\n@pytest.mark.parametrize('i', range(20))\ndef test_it(i): pass\n"
     orders = []
     for seed in (1, 1, 2):

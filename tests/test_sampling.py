@@ -1,4 +1,4 @@
-"""A sampled controller: closed forms, time events that no communication step moves, sensors and their noise."""
+"""A sampled controller: closed forms, time events at any communication step, sensors and their noise."""
 
 import functools
 import re
@@ -98,7 +98,7 @@ def test_a_sampled_joint_is_stable_up_to_its_closed_form(Kp, Kd, stable):
 @pytest.mark.parametrize("differences", [False, True])
 @pytest.mark.parametrize("delay", [0.0, 0.0008, 0.003, 0.01, 0.023])
 def test_the_motion_of_an_unstable_sampled_loop_grows_by_its_spectral_radius(delay, differences):
-    """The two largest eigenvalues are those of the recurrence of second order that the motion ends in."""
+    """A recurrence of second order of the final motion gives the two largest eigenvalues."""
     T, Kp, Kd = 0.01, 900.0, 600.0 if delay < 0.01 else 130.0
     gains = dict(control_period=T, control_delay=delay, Kp=[Kp], Kd=[Kd], q_des=[0.0])
     plant = slider(**gains, v_from_q=float(differences), q_min=[-1e99], q_max=[1e99])
@@ -135,7 +135,7 @@ KINDS = ("python", "fmi2", "fmi3")
 
 
 def run(fmu, stop_time, step, changes=None, adds_up=False, **settings):
-    """q, v, tau, q_meas, v_meas at each communication point, whose times are added up or not."""
+    """q, v, tau, q_meas, v_meas at each communication point, whose times are accumulated or not."""
     settings = {**EXACT, **settings}
     fmu = load_fmu(fmu)
     with instantiate(fmu) as instance:
@@ -172,7 +172,7 @@ def test_no_communication_step_moves_a_sample(fmus, kind, period, delay):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_input_at_a_sampling_time_is_seen_by_that_sample(fmus, kind):
-    """However the importer adds up its steps; before, the effort that is put out is the one that would act."""
+    """The importer may accumulate its steps; the output before is the effort that would act."""
     fmu = fmus("slider", "effort", kind)
     for step, adds_up in ((0.001, False), (0.001, True), (0.01, True)):
         points = [k * 0.05 for k in range(1, 19)]
@@ -228,7 +228,7 @@ def test_cvode_sees_the_time_events_in_model_exchange(fmus, kind, delay):
     ],
 )
 def test_uniform_words_are_those_of_random123(counter, key, words):
-    """Known answers of the authors' library, file kat_vectors, philox4x32 10."""
+    """The known answers are those of the authors' library, file kat_vectors, philox4x32 10."""
     assert philox(counter, key) == words
 
 
@@ -240,7 +240,7 @@ def test_the_logarithm_is_right_to_four_units_in_the_last_place():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_flavour_has_the_same_noise_to_the_bit(fmus, kind):
-    """A joint at rest at 0 shows the noise alone; at communication points where nothing else is sampled."""
+    """A joint at rest at 0 shows only noise; without a period, sensors are sampled at communication points."""
     for seed in (0, 1, 2**31 - 1):
         rows = run(fmus("slider", "effort", kind), 0.5, 0.01, q_start=0.0, q_noise=1.0, v_noise=1.0, seed=seed)
         assert [tuple(row[3:]) for row in rows] == [normal_pair(seed, k, 0) for k in range(51)]
@@ -287,7 +287,7 @@ def test_every_platform_has_the_same_noise_to_the_bit(machine, tmp_path):
 
 
 def test_noise_is_normal_and_independent():
-    """Chi-square over 1e6 numbers of both channels, of neighbours in time, joint and kind, and of seeds."""
+    """A chi-square test covers 1e6 numbers of both channels, and of neighbours in time, joint, kind and seed."""
     engine = native_models.engine("twodof")
     n = 250_000
     noise = np.empty((4, n, 2))  # seeds 3 and 4, joints 0 and 1
@@ -428,7 +428,7 @@ def test_bad_parameters_are_refused_by_name(fmus, kind, case):
 
 
 def test_the_discrete_loop_of_a_linear_model_has_the_eigenvalues_of_the_motion(fmus):
-    """The plant with its effort held, from one linear model, and the law from that of the continuous loop."""
+    """One linear model gives the plant with held effort, that of the continuous loop gives the law."""
     fmu, T = fmus("twodof", "joint", "fmi2"), 0.02
     at: dict = {"q_des": (0.5, 0.7), "Kp": 60.0, "Kd": 9.0}
     plant = linearise(fmu, {**at, "control_period": T, "control_delay": 0.03, **SEEN}, inputs=["tau_ext"])

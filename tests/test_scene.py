@@ -1,7 +1,6 @@
 """The scene: transforms against Pinocchio's kinematics, fitted shapes against the meshes.
 
-Quaternions and rpy angles are turned into matrices by SciPy, meshes are read by trimesh or, where
-they are COLLADA files, by Pinocchio.
+SciPy converts quaternions and rpy angles to matrices. trimesh reads meshes, Pinocchio COLLADA files.
 """
 
 import io
@@ -61,7 +60,7 @@ class Transform(NamedTuple):
 
 
 def transforms_of(scene: Scene, joints: Iterable[Joint], q: np.ndarray) -> list[list[Transform]]:
-    """Return transforms of some joints at each of N positions, as a bag has them."""
+    """Return a bag's transforms of some joints at each of N positions."""
     each = [np.broadcast_to(part, (len(q), 7)) for part in scene.transforms(joints, q)]
     return [
         [
@@ -80,7 +79,7 @@ def pose(translation: Iterable[float], rotation: Rotation) -> np.ndarray:
 
 
 def chained(transforms: Iterable[Transform]) -> Placements:
-    """Poses of all child links in the root, as tf2 computes them."""
+    """Poses of all child links in the root, computed as tf2 does."""
     local: dict[str, tuple[str, np.ndarray]] = {}
     for parent, child, translation, rotation in transforms:
         assert child not in local
@@ -268,7 +267,7 @@ def test_target_follows_the_end_effector_along_axes_that_are_not_controlled(robo
 
 
 def geometries(urdf: str) -> list[tuple[ET.Element, np.ndarray]]:
-    """Shapes of all visuals and collisions in the order of the file, and their poses."""
+    """Shapes of all visuals and collisions in file order, and their poses."""
     found = []
     for link in ET.fromstring(urdf).findall("link"):
         for part in (*link.findall("visual"), *link.findall("collision")):
@@ -287,7 +286,7 @@ def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def outside(shape: ET.Element, points: np.ndarray) -> float:
-    """Return the distance by which points are outside of a box or cylinder about their origin, m."""
+    """Return the distance of points outside of a box or cylinder about their origin, m."""
     if shape.tag == "box":
         half = np.array([float(word) for word in shape.get("size", "").split()]) / 2
         return float((np.abs(points) - half).max())
@@ -322,7 +321,7 @@ def assert_shapes_hold_the_meshes(description: str, urdf: str, vertices: Callabl
 
 
 def assert_same_robot(description: str, urdf: str) -> None:
-    """As read by urdfdom, with all but the geometry."""
+    """Assert that urdfdom reads the same robot, except for the geometry."""
     found, expected = pin.buildModelFromXML(description), pin.buildModelFromXML(urdf)
     assert found == expected
 
@@ -372,7 +371,7 @@ def with_mesh(attributes: str = "", origin: str = "") -> str:
 
 
 def placed(seed: int) -> np.ndarray:
-    """Somewhere, turned in some way; the first is where it was made."""
+    """Return a random pose for a seed; 0 gives the identity."""
     if seed == 0:
         return np.eye(4)
     turn = Rotation.from_rotvec(np.random.default_rng(seed).normal(size=3))
@@ -414,7 +413,7 @@ def test_fit_finds_the_axis_of_a_cylinder(axis):
 
 
 def fitted_shape(mesh: trimesh.Trimesh, urdf: str = "") -> tuple[ET.Element, np.ndarray]:
-    """Return the shape that stands for a mesh in a robot description, and its pose."""
+    """Return the shape that replaces a mesh in a robot description, and its pose."""
     content, urdf = mesh.export(file_type="stl"), urdf or with_mesh()
     assert isinstance(content, bytes)
     description = Scene(urdf, [], "thing", lambda _: content).description
@@ -424,7 +423,7 @@ def fitted_shape(mesh: trimesh.Trimesh, urdf: str = "") -> tuple[ET.Element, np.
 
 
 def single(vertices: np.ndarray) -> np.ndarray:
-    """With the precision that an STL file has."""
+    """Round to the precision of an STL file."""
     return np.asarray(vertices, dtype=np.float32).astype(float)
 
 
@@ -468,7 +467,7 @@ UP = "../" * 40  # from a temporary folder to the root
 
 
 def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path, caplog):
-    """A page, or a file made of it, would have the secret's bytes as vertices."""
+    """Otherwise a page would contain the other file's bytes as vertices."""
     (tmp_path / "secret").write_bytes(struct.pack("<9f", *range(9)))
     content = {
         "asset": {"version": "2.0"},
@@ -487,7 +486,7 @@ def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path, caplog):
 
 
 def test_library_of_colours_is_not_read_with_a_mesh(tmp_path):
-    """One that is a pipe would be waited for without end."""
+    """It may be a pipe, for which reading would wait without end."""
     os.mkfifo(tmp_path / "pipe")
     content = f"mtllib {UP}{tmp_path}/pipe\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n"
     code = (
@@ -517,7 +516,7 @@ def test_meshes_of_a_scene_are_opened_by_their_uris(native_path, tmp_path):
 
 
 def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path):
-    """By Pinocchio's reader of URDF and meshes, from the description in the bag and the files that it names."""
+    """Pinocchio reads URDF and meshes by the bag's description and the files that it names."""
     fmu = twodof.build_fmu(tmp_path / "panda.fmu", twodof.stock_robot("panda"))
     twodof.simulate(fmu, twodof.Bag(tmp_path / "Müller", meshes=True), stop_time=0.02)
     description = description_in(tmp_path / "Müller")

@@ -15,7 +15,7 @@ from twodof.pages.serving import LARGEST, MOST_CONNECTIONS, Server
 
 
 def names_of(*names: str) -> list[str]:
-    """As a browser writes them into Host."""
+    """Names of a host as a browser writes them into Host."""
     return [f"{name}:{port}" for name in names for port in (80, 9000)] + [*names]
 
 
@@ -38,7 +38,7 @@ ASKED = {
     ids=ASKED,
 )
 def test_page_answers_to_its_own_name_and_its_own_page_alone(host, own, other):
-    """Requests for the page and for a websocket, with the headers that a browser sends."""
+    """Requests are for the page and for a websocket, with a browser's headers."""
 
     async def talk(connection: object) -> None:
         pass
@@ -112,7 +112,7 @@ def test_port_that_another_is_about_to_serve():
 
 @pytest.mark.parametrize("method", ["HEAD", "POST", "DELETE"])
 def test_what_a_page_is_not_asked_for_is_answered(method):
-    """By its own word, as by curl -I."""
+    """Methods other than GET get status 405, for example with curl -I."""
     with Server(b"page", port=0) as server:
         asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)
         asking.request(method, "/")
@@ -121,7 +121,7 @@ def test_what_a_page_is_not_asked_for_is_answered(method):
 
 
 def test_connections_without_a_request_are_bounded() -> None:
-    """Idle ones neither use up the descriptors nor keep others from the page; websockets stay open."""
+    """Idle ones neither use up the descriptors nor block others; websockets stay open."""
     page = Server(b"page", port=0, talk=lambda connection: connection.wait_closed(), token="t")
     with page, connect(page.url.replace("http:", "ws:").replace("?", "socket?")) as held, ExitStack() as idle:
         before = len(os.listdir("/proc/self/fd"))

@@ -1,4 +1,4 @@
-"""The Python flavour through FMPy: each test loads it in a process of its own."""
+"""The Python flavour through FMPy; each test loads it in its own process."""
 
 import importlib
 import json
@@ -89,7 +89,7 @@ def test_different_fmus_run_one_after_the_other_and_interleaved(fmu_path, ur5_fm
 
 @in_child_process
 def test_an_fmu_runs_the_code_inside_its_own_zip(fmu_path, tmp_path):
-    """A patched checkout and another FMU whose code differs are in the same process."""
+    """A patched checkout and another FMU with other code are in the same process."""
     sys.modules["twodof.plant.plant"].Plant.step = None
     other = changed_plant(fmu_path, tmp_path, "Plant.x = property(lambda self: [42.0, 42.0])\n")
     driver, changed = Driver(fmu_path).initialise(), Driver(other).initialise()
@@ -113,7 +113,7 @@ def test_the_unzip_folder_and_the_working_directory_may_go(fmu_path, tmp_path):
 
 @in_child_process
 def test_an_instance_runs_after_another_was_interrupted_while_it_loaded(fmu_path):
-    """Ctrl-C in a notebook's first cell breaks no later one."""
+    """Ctrl-C in a notebook's first cell affects no later one."""
 
     class Interrupt:
         def find_spec(self, name, *_):
@@ -358,7 +358,7 @@ def test_start_outside_the_limits_warns_and_a_tolerance_is_ignored_with_a_line(f
 
 @in_child_process
 def test_refusals_and_resets_in_any_number_do_not_end_the_process(fmu_path):
-    """Three exceptions and a reset end a pythonfmu process; so there are none."""
+    """Three exceptions and a reset would end a process with pythonfmu; so none is raised."""
     driver = Driver(fmu_path).initialise()
     for _ in range(5):
         for refuse in REFUSALS.values():
@@ -459,7 +459,7 @@ CANNOT = (
 
 @in_child_process
 def test_what_this_flavour_cannot_do_is_as_documented(fmu_path, native_path):
-    """Each gives whether it could be done, and whether what the row says happened instead."""
+    """Each returns whether the feature works, and whether the documented effect occurs instead."""
     for row in CANNOT:
         assert row(native_path) == (True, False), row
         assert row(fmu_path) == (False, True), row

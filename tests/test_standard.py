@@ -297,7 +297,7 @@ def texts(fmus: dict[int, Path], fmu_path: Path, tmp_path_factory: pytest.TempPa
 
 
 def test_value_references_are_indices(texts: dict[str, bytes]) -> None:
-    """OMSimulator reads them so."""
+    """OMSimulator requires it."""
     for name, text in texts.items():
         (variables,) = lxml.etree.fromstring(text).iter("ModelVariables")
         references = [int(variable.get("valueReference")) for variable in variables]
@@ -305,7 +305,7 @@ def test_value_references_are_indices(texts: dict[str, bytes]) -> None:
 
 
 def test_numbers_are_those_that_every_reader_knows(texts: dict[str, bytes]) -> None:
-    """C++ reads no subnormal number: std::stod throws."""
+    """std::stod of C++ throws for subnormal numbers."""
     for text in texts.values():
         for element in lxml.etree.fromstring(text).iter():
             for key in ("min", "max", "nominal", "start"):
@@ -325,7 +325,7 @@ def test_documentation_says_which_version_it_is(fmus: dict[int, Path], fmu_path:
 
 
 def test_headers_of_fmi_3_are_the_importers(fmus: dict[int, Path]) -> None:
-    """FMI 3.0.2, section 2.5.1.3: they are not included in the FMU."""
+    """FMI 3.0.2, section 2.5.1.3: the FMU does not include them."""
     with zipfile.ZipFile(fmus[3]) as archive:
         assert not [name for name in archive.namelist() if re.search("fmi3[A-Z].*[.]h$", name)]
 

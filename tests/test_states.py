@@ -1,11 +1,10 @@
 """Random programs of calls: each state of an FMU depends on its history alone.
 
-A program sets, steps, saves, restores, serialises, frees, resets and reads, and makes calls that
-are refused. What has been set and stepped since the last initialisation is its history: a straight
-line, which saving leaves, restoring takes back and resetting empties. After every operation the FMU
-gives, bit for bit, what a fresh instance gives that carries out the history and nothing else; and
-the flavours agree on histories that keep away from singularities. All FMUs run in a process beside
-the tests: where one crashes, its program fails.
+A program sets, steps, saves, restores, serialises, frees, resets and reads, and makes refused calls. Its history is the
+list of settings and steps since the last initialisation; restoring returns to an earlier history, and resetting empties
+it. After every operation, the FMU's values are bit-identical to those of a new instance that does only the history. The
+flavours agree on histories away from singularities. All FMUs run in a separate process; if one crashes, its program
+fails.
 """
 
 import re
@@ -76,7 +75,7 @@ TARGETS = {"task": "x_des", "pose": "x_des", "joint": "q_des", "effort": "tau_cm
 
 
 class Program(list):
-    """Operations, each a tuple of a name and arguments; shown one a line."""
+    """Operations, each a tuple of a name and arguments, shown one per line."""
 
     def __repr__(self):
         return "".join(["[\n", *(f"    {operation},\n" for operation in self), "]"])
@@ -86,7 +85,7 @@ class Program(list):
 
 
 class Master:
-    """Carries out operations, which are its methods; keeps the time and the saved states."""
+    """Executes operations, which are its methods; stores the time and the saved states."""
 
     def __init__(self, fmu, folder):
         self.fmu = fmu
@@ -94,7 +93,7 @@ class Master:
         self.time, self.saved = 0.0, {}
 
     def answer(self, operation):
-        """The statuses of the operation's calls, the FMU's complaints, what was read."""
+        """The statuses of the operation's calls, the FMU's error messages, and the read values."""
         self.statuses: list[int] = []
         self.driver.log.clear()
         name, *arguments = operation
@@ -134,7 +133,7 @@ class Master:
         return {group: [next(rest) for _ in vrs] for group, vrs in (references | truths).items()}
 
     def step(self, h, late=0.0):
-        """A step that is discarded is tried once more."""
+        """Do a step; repeat it once if it is discarded."""
         point = self.time + late
         self.call("doStep", point, h)
         if self.statuses == [DISCARD]:
@@ -149,7 +148,7 @@ class Master:
         self.call("reset")
 
     def fail_to_start(self, name, value):
-        """An initialisation that is refused for a parameter, between two resets."""
+        """Do an initialisation that is refused for a parameter, between two resets."""
         self.reset()
         self.set(name, value)
         self.enter(0.0)
@@ -157,7 +156,7 @@ class Master:
         self.reset()
 
     def save(self, slot):
-        """Over the state that was saved there, if there is one."""
+        """Save into a slot, over its state if it has one."""
         state, _ = self.saved.get(slot, (fmi2FMUstate(), 0.0))
         self.call("fmi2GetFMUstate", self.driver.slave.component, state)
         self.saved[slot] = state, self.time
@@ -171,14 +170,14 @@ class Master:
         self.call("freeFMUstate", state)
 
     def serialise(self, slot):
-        """Replace a saved state by what its bytes give."""
+        """Replace a saved state by its deserialised bytes."""
         state, time = self.saved[slot]
         data = self.call("serializeFMUstate", state)
         self.call("freeFMUstate", state)
         self.saved[slot] = self.call("deSerializeFMUstate", data), time
 
     def damage(self, slot):
-        """Restore a state whose last bytes are missing."""
+        """Restore a state without its last bytes."""
         state, _ = self.saved[slot]
         data = self.call("serializeFMUstate", state)
         state = self.call("deSerializeFMUstate", data[:-9])
@@ -187,7 +186,7 @@ class Master:
             self.call("freeFMUstate", state)
 
     def wreck(self, slot):
-        """Set inputs that no step can be taken with, try one, and restore."""
+        """Set inputs with which no step succeeds, try a step, and restore."""
         for name, huge in (("Kp", 1e308), ("x_des", 1e300), ("q_des", 1e300), ("tau_cmd", 1e308)):
             if vrs := self.driver.references(name):
                 self.set(name, (huge,) * len(vrs))
@@ -196,7 +195,7 @@ class Master:
         self.restore(slot)
 
     def move(self):
-        """Go on in a new instance; it takes over the state and all saved ones as bytes."""
+        """Continue in a new instance, which receives the state and all saved ones as bytes."""
         self.save("present")
         old, self.driver = self.driver, Driver(self.fmu, self.driver.folder)
         for slot, (state, time) in self.saved.items():
@@ -209,7 +208,7 @@ class Master:
 
 
 def carry_out(fmu, folder, program):
-    """The answers of a fresh instance to the operations of a program."""
+    """The answers of a new instance to the operations of a program."""
     master = Master(fmu, folder)
     answers = [master.answer(operation) for operation in program]
     for slot in list(master.saved):
@@ -250,7 +249,7 @@ def expectations(program):
 
 
 def is_legal(operation, history):
-    """By the state machine of FMI 2.0.4, section 4.2.4, and the checks of values."""
+    """Return whether it is legal by the state machine of FMI 2.0.4, section 4.2.4, and the ranges of values."""
     done = {name for name, *_ in history}
     phase = next((name for name in ("terminate", "exit", "enter") if name in done), "")
     match operation:
@@ -276,8 +275,8 @@ def is_legal(operation, history):
 def is_right(flavour, operation, expected, answer):
     """Return True if statuses and log are as expected.
 
-    The native flavour refuses by fmi2Error. The Python one cannot: it logs, and discards the next
-    step, which is then taken at the second attempt.
+    The native flavour refuses by fmi2Error. The Python one logs, and discards the next step, which succeeds at the
+    second attempt.
     """
     statuses, complaints, _ = answer
     complained, refused = bool(complaints), expected.refused
@@ -293,19 +292,19 @@ def is_right(flavour, operation, expected, answer):
 
 
 class EscapeError(Exception):
-    """A joint at a limit and an arm near a singularity: the others' speeds grow beyond all bounds.
+    """A joint is at a limit and the arm near a singularity: the speeds of the others grow without bound.
 
-    q̈ is quadratic in q̇ there, and rounding says whether the arm passes.
+    q̈ is quadratic in q̇ there, and rounding decides whether the arm passes.
     """
 
 
 def run(fresh, flavour, program):
     """Return the values read after the operations of a program: (index, history, values by group).
 
-    ``fresh`` gives the answers of a fresh instance to a program.
+    ``fresh`` gives the answers of a new instance to a program.
 
     Raises:
-        EscapeError: the speeds of a step grow beyond all bounds.
+        EscapeError: the speeds of a step grow without bound.
     """
     readings = []
     answers = fresh(program)
@@ -321,9 +320,9 @@ def run(fresh, flavour, program):
 
 
 def states(fresh, flavour, program):
-    """Return the states to which the histories of a program lead, each run alone.
+    """Return the states at the ends of the histories of a program, each run alone.
 
-    Values by group by history, None before initialisation mode.
+    They are values by group by history, None before initialisation mode.
     """
     readings = run(fresh, flavour, program)
     alone: dict[tuple, Any] = {}
@@ -342,16 +341,16 @@ def states(fresh, flavour, program):
 
 
 def far(theirs, ours, group):
-    """Largest difference of a group's values, relative to those above 1."""
+    """Largest difference of a group's values, relative to values above 1."""
     scale = np.maximum(1.0, np.abs(ours[group]))
     return (np.abs(np.subtract(theirs[group], ours[group])) / scale).max()
 
 
 def compared(arm, python, native, again):
-    """The histories that were compared, and agree; the others go near a singularity.
+    """The histories that were compared, and agree; the others pass near a singularity.
 
-    To 1e-9, or where the motion is that sensitive, as well as with a start that is one unit in the
-    last place away. ``again`` gives the native flavour's answers to a program.
+    They agree to 1e-9, or to the effect of a change in the last digit of the start. ``again`` gives the native
+    flavour's answers to a program.
     """
     found = {()}
     for history in sorted(python, key=len):
@@ -378,7 +377,7 @@ def compared(arm, python, native, again):
 
 
 class Arm(NamedTuple):
-    """A robot, its FMUs and where its programs move it."""
+    """A robot, its FMUs and the region of its programs."""
 
     robot: Robot
     control: str
@@ -390,8 +389,8 @@ class Arm(NamedTuple):
     def keeps_away(self, history, before, after):
         """Return True if the last operation keeps away from the singularities of J⁺.
 
-        σ_min/σ_max of J is at least 2.5 rcond where it ends, and so it is anywhere within the angle
-        of a step at the speeds of its ends, as it changes by about 1 per radian at most.
+        At its end, σ_min/σ_max of J is at least 2.5 rcond, and also at any angle within a step at the speeds of its
+        ends, because it changes by at most about 1 per radian.
         """
         if "rcond" not in after:
             return True
@@ -458,7 +457,7 @@ def near(centre, distance):
 
 
 def one(name, *arguments):
-    """A phrase, which is a list of operations, of one; from strategies for its arguments."""
+    """A phrase, a list of operations, with one operation, given strategies for its arguments."""
     return st.tuples(st.just(name), *arguments).map(lambda operation: [operation])
 
 
@@ -472,12 +471,12 @@ def some(part, least, most):
 
 
 def choice(*phrases):
-    """One of these; inside a phrase, as ``one_of`` deals with what is in it as with its own."""
+    """One of these strategies; within a phrase, ``one_of`` would merge nested alternatives."""
     return phrase(st.one_of(*phrases))
 
 
 def setting(values):
-    """Set one of these, given strategies for the values."""
+    """Set one of these inputs, given strategies for the values."""
     return choice(*(one("set", st.just(name), value) for name, value in values.items()))
 
 
@@ -489,7 +488,7 @@ def read_along(draw, phrases):
 
 
 def inputs_of_law(arm):
-    """Strategies for the inputs that an arm's control has of its own, by name."""
+    """Strategies for the inputs of an arm's control law, by name."""
     n, m = len(arm.rest), len(arm.x)
 
     def gains(size, of=""):
@@ -634,7 +633,7 @@ def programs(arm):
 
 
 def without_empty_slots(program):
-    """Without the operations on saved states that there are not."""
+    """Remove operations on saved states that do not exist."""
     kept, filled = Program(), set()
     for operation in program:
         match operation:

@@ -68,7 +68,7 @@ def evaluations(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> int:
 
 
 def test_coefficients_satisfy_the_order_conditions_of_a_w_method_and_damp_what_is_stiff():
-    """Hairer & Wanner, "Solving ODEs II", IV.7: order 3 and 2 with any T; R(∞) = 0."""
+    """Hairer & Wanner, "Solving ODEs II", IV.7: orders 3 and 2 with any T; R(∞) = 0."""
     g = rosenbrock.GAMMA
     lower = np.zeros((4, 4))
     coupling, a = lower.copy(), lower.copy()
@@ -110,7 +110,7 @@ def test_joints_that_are_not_stiff_move_as_by_dormand_prince_to_the_bit(damping)
 
 
 def test_the_error_falls_with_the_third_power_of_the_step(pendulum):
-    """A stiff finger is on a swing; the tolerance accepts all steps."""
+    """A stiff finger is on a pendulum; the tolerance accepts all steps."""
     errors = []
     changes = {"damping": [0.0, 0.05], "q_start": [0.3, 0.2], "v_start": [1.0, 0.0], "gravity": [0.0, 0.0, -9.81]}
     reference = both(pendulum, started(pendulum, DORMAND_PRINCE, **changes, rtol=1e-11, atol=1e-13), 1, 0.2)
@@ -123,7 +123,7 @@ def test_the_error_falls_with_the_third_power_of_the_step(pendulum):
 @pytest.mark.parametrize("rigid", [False, True], ids=["clamp", "rigid"])
 @pytest.mark.parametrize("friction", [[0.0, 0.0], [0.2, 1e-4]], ids=["smooth", "friction"])
 def test_stops_and_friction_are_those_of_the_other_integrator(pendulum, rigid, friction):
-    """The swing falls onto its stop and the finger to and fro between its own, at tight tolerances."""
+    """The pendulum falls onto its stop, and the finger moves between its own, at tight tolerances."""
     ends = []
     for integrator in (DORMAND_PRINCE, STIFF):
         plant = started(
@@ -146,7 +146,7 @@ def test_stops_and_friction_are_those_of_the_other_integrator(pendulum, rigid, f
 
 
 def test_a_stiff_joint_rests_on_its_stop_and_leaves_it(pendulum):
-    """As by Dormand–Prince, which takes many more steps; M⁻¹D is 1e5 1/s."""
+    """Dormand–Prince agrees with many more steps; M⁻¹D is 1e5 1/s."""
     changes = {"damping": [0.1, 0.5], "q_max": [2.0, 0.01], "q_start": [0.0, 0.0], "friction": [0.01, 0.02], **TIGHT}
     plants = [started(pendulum, i, **changes) for i in (AUTOMATIC, DORMAND_PRINCE)]
     for effort in (3.0, 0.01, -1.5):
@@ -160,7 +160,7 @@ def test_a_stiff_joint_rests_on_its_stop_and_leaves_it(pendulum):
 
 
 def test_samples_of_a_controller_are_taken_at_their_times(pendulum):
-    """A saw of efforts by a sampled joint controller on stiff joints."""
+    """A sampled joint controller applies a sawtooth of efforts to stiff joints."""
     of = Engine(from_urdf(PENDULUM, "tip", "xz", "joint"))
     changes = {"damping": [0.5, 0.05], "control_period": 0.004, "control_delay": 0.0013, "q_des": [0.4, -0.3]}
     tight = both(of, started(of, DORMAND_PRINCE, **changes, **TIGHT), 1, 6 * STEP)
@@ -175,7 +175,7 @@ def test_samples_of_a_controller_are_taken_at_their_times(pendulum):
 @in_child_process
 @pytest.mark.parametrize("damping", [0.1, 1e4])
 def test_a_restored_fmu_goes_on_to_the_bit_in_both_flavours(damping, fmu_path, native_path):
-    """As an FMU that took all the steps, whichever integrator the automatic choice takes."""
+    """It equals an FMU that did all steps, with either choice of the automatic integrator."""
     runs = []
     for path in (fmu_path, native_path):
         driver = Driver(path).initialise(damping=[damping] * 2, friction=[0.05, 0.0], q_max=[0.51, 3.0])
@@ -191,7 +191,7 @@ def test_a_restored_fmu_goes_on_to_the_bit_in_both_flavours(damping, fmu_path, n
 
 
 def test_dense_output_is_of_third_order_and_velocities_begin_with_the_acceleration():
-    """The system is an oscillator with damping, from rest, whose solution SciPy has."""
+    """SciPy solves a damped oscillator from rest."""
 
     def rates(y):
         return [y[1], -40.0 * y[0] - 3.0 * y[1]]

@@ -1,6 +1,6 @@
 """Motions that are too fast for an explicit integrator: right or refused, never silently wrong.
 
-The oracle is SciPy's implicit Radau on equations of motion written here.
+The oracle is SciPy's implicit Radau on separately written equations of motion.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def test_tolerances_that_nothing_satisfies_are_named(tolerance, length):
 
 
 def test_a_hand_of_small_inertias_and_strong_damping_moves_as_an_implicit_solver_says():
-    """The allegro hand, D/M up to 8e5 1/s; inertias that no body has are made those of a cube."""
+    """The allegro hand has D/M up to 8e5 1/s; impossible inertias are replaced by those of a cube."""
     urdf = robots_folder() / "allegro_hand_description" / "urdf" / "allegro_left_hand.urdf"
     tree = ET.fromstring(urdf.read_text())
     for inertia in tree.iter("inertia"):

@@ -57,7 +57,7 @@ def steered(turn: Iterator[int]) -> dict[str, Any] | None:
 
 
 def logged(fmus: dict[str, Path], path: Path, **options: Any) -> Path:
-    """A bag of three robots, of which one is steered."""
+    """A bag of three robots, one of which receives new inputs."""
     steer = {"fleet/right": partial(steered, iter(range(10**6)))}
     bag = twodof.Bag(path, **options)
     simulate_together([Member(run, [bag.of(name)], steer.get(name, lambda: None)) for name, run in runs(fmus).items()])
@@ -66,13 +66,13 @@ def logged(fmus: dict[str, Path], path: Path, **options: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def three(fmus, tmp_path_factory):
-    """A bag of three robots, to be read."""
+    """A bag of three robots for reading."""
     return logged(fmus, tmp_path_factory.mktemp("three") / "bag", scene=True)
 
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_each_robot_has_its_topics_as_if_it_were_alone(fmus, tmp_path, storage):
-    """By rosbags, bit for bit those of a bag of its own."""
+    """By rosbags, they are bit-identical to those of a separate bag."""
     together = messages_of(logged(fmus, tmp_path / "bag", storage=storage, scene=True, effort=True))
     topics = set()
     for name, run in runs(fmus).items():
@@ -250,7 +250,7 @@ def test_a_bag_of_several_is_replaced_when_asked_to(fmus, tmp_path):
 
 
 def test_a_bag_that_is_not_open_takes_no_sample(native_path, tmp_path):
-    """Nothing would write it."""
+    """The sample would be lost."""
     run = experiment(native_path, stop_time=0.1)
     bag = twodof.Bag(tmp_path / "bag")
     bag.begin(run)
@@ -288,7 +288,7 @@ def test_a_robots_bag_is_recovered_by_its_folder(three, tmp_path):
 
 
 def test_each_robot_may_have_its_own_thread(native_path, tmp_path):
-    """They come, begin and leave at one instant."""
+    """They open, begin and end at the same instant."""
     run, names = runs({"robot": native_path}, 0.1)["robot"], ("left", "right")
     samples = list(twodof.samples(run))
     for trial in range(3):

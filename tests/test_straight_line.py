@@ -63,7 +63,7 @@ def test_calls_of_the_generator_grow_with_the_joints_alone():
 
 
 def test_blocks_of_long_functions_are_short():
-    """Compilers take time quadratic in a block: 64 joints in general position took 42 s, and take 23 s."""
+    """Compilers take time quadratic in the block length: 64 joints took 42 s, and take 23 s."""
     for joints, branched in ((7, False), (64, True)):
         robot = load_robot(chain_urdf(("zyx" * joints)[:joints]), "tip", "xyz")
         table = variable_table(robot, {"q_start": (0.0,) * joints, "x_des": (0.0,) * 3})

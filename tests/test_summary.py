@@ -27,7 +27,7 @@ FOOTER = 20 + 8  # its fields, and the magic behind it
 
 @pytest.fixture(scope="module")
 def original(native_path, tmp_path_factory):
-    """Several chunks of a scene's topics."""
+    """A bag with several chunks of a scene's topics."""
     bag = twodof.Bag(tmp_path_factory.mktemp("original") / "bag", scene=True)
     twodof.simulate(native_path, bag, stop_time=30.0, stamp_start=START)
     return bag.path
@@ -114,7 +114,7 @@ def test_a_summary_with_a_flipped_bit_is_not_believed(bag):
 
 @pytest.mark.parametrize("field", [0, 22], ids=["messages", "chunks"])
 def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
-    """With a checksum that is right: messages and those by channel, chunks and their index."""
+    """The checksum is valid; messages and those by channel, or chunks and their index, contradict each other."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
     start, place = statistics_of(content)
@@ -125,7 +125,7 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
 
 
 def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(bag):
-    """With a checksum that is right, and a channel of another number."""
+    """The checksum is valid, and a channel has another number."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
     start, _ = statistics_of(content)
@@ -177,7 +177,7 @@ def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag):
 
 
 def test_messages_that_the_summary_alone_has_are_missed(tmp_path):
-    """Its checksum is right, and its only chunk has the topic by another name."""
+    """Its checksum is valid, and its only chunk has the topic under another name."""
     file = tmp_path / "bag" / "bag.mcap"
     file.parent.mkdir()
     (file.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
@@ -200,7 +200,7 @@ def test_messages_that_the_summary_alone_has_are_missed(tmp_path):
 
 @pytest.mark.parametrize("name", ["/joint_states", "/other"])
 def test_ends_of_another_writer_in_any_order(tmp_path, name):
-    """Small chunks, whose stamps overlap; another topic in some of them."""
+    """Small chunks have overlapping stamps; some have another topic too."""
     stamps = np.random.default_rng(3).permutation(400)
     file = tmp_path / "bag" / "bag.mcap"
     file.parent.mkdir()
@@ -223,7 +223,7 @@ def test_ends_of_another_writer_in_any_order(tmp_path, name):
 
 
 def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path):
-    """The messages have three channels and few lengths at random, with runs of turns among them."""
+    """Messages have three channels and a few lengths at random, with periodic runs among them."""
     chance, file = random.Random(5), tmp_path / "x.mcap"
     parts = [
         [(chance.randrange(3), chance.choice((4, 8, 9))) for _ in range(chance.randrange(1, 7))]

@@ -30,7 +30,7 @@ STEP, STOP = 0.01, 5.0
 
 
 def response(kp: float, kd: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """φ and φ' of φ'' + kd φ' + kp φ = 0, φ(0) = 1, φ'(0) = 0; sound at critical damping too."""
+    """φ and φ' of φ'' + kd φ' + kp φ = 0, φ(0) = 1, φ'(0) = 0; accurate at critical damping too."""
     a = kd / 2
     w = np.sqrt(complex(a * a - kp))
     z = w * t
@@ -54,7 +54,7 @@ def gains() -> list[tuple[float, float]]:
 
 @pytest.fixture(scope="module")
 def judged(native_path):
-    """The metrics of the pairs, by the runs themselves."""
+    """The metrics of the pairs, by single runs."""
     options = {"stop_time": STOP, "step": STEP, "settings": {}}
     job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)
     with Runner(job) as runner:
@@ -86,7 +86,7 @@ def test_metrics_are_those_of_the_closed_form(judged):
 
 
 def test_peaks_are_those_of_the_closed_form(judged):
-    """Joint velocities by the inverse of the Jacobian, torques by the textbook's dynamics."""
+    """Joint velocities are by the inverse Jacobian, torques by the textbook's dynamics."""
     t = np.arange(501) * STEP
     start = oracles.position(Q0)
     arm = oracles.TwoLinkArm(Path(__file__).parents[1] / "urdf/2dof.urdf", 9.81)
@@ -108,7 +108,7 @@ def test_peaks_are_those_of_the_closed_form(judged):
 
 
 def test_time_at_limits_is_that_of_the_samples(native_path):
-    """The first joint would pass 0.2 rad on its way down; samples tell how long it stays there."""
+    """The first joint would pass 0.2 rad on its way down; samples show how long it stays there."""
     settings = {"q_min": (0.2, -3.0)}
     (row,) = sweep(native_path, grid={"Kp": [50.0]}, settings=settings).to_dict("records")
     samples = list(twodof.samples(native_path, settings={**settings, "Kp": 50.0}))
@@ -127,7 +127,7 @@ def test_what_is_not_defined_is_null(native_path):
 @pytest.mark.parametrize("max_step", [1e-3, 1e-9], ids=["finished", "discarded"])
 @pytest.mark.parametrize("flavour", ["python", "native"])
 def test_a_trace_has_the_numbers_of_the_samples(fmu_path, native_path, flavour, max_step):
-    """To the bit; where a run fails, so do both, at the same step and for the same reason."""
+    """They are bit-identical; if a run fails, both fail at the same step for the same reason."""
     fmu = {"python": fmu_path, "native": native_path}[flavour]
     run = twodof.experiment(fmu, stop_time=0.5, settings={"max_step": max_step})
     ends = []
@@ -234,7 +234,7 @@ def test_a_missing_extra_is_named(package, extra, options, native_path, tmp_path
 
 
 def test_a_runner_instantiates_once_and_repeats_to_the_bit(native_path, monkeypatch):
-    """In any order, what a run gives is what a fresh instance gives."""
+    """In any order, a run gives the results of a new instance."""
     made = []
     instantiate = runner_module.instantiate
 
@@ -296,9 +296,9 @@ def test_each_run_has_its_outcome_and_harms_no_other(fmu_path, tmp_path):
 
 
 def test_a_run_that_kills_is_given_up_alone(fmu_path, tmp_path, monkeypatch):
-    """It is begun three times; what was in its batch, twice at most; all else once.
+    """It starts three times, runs of its batch at most twice, and all others once.
 
-    Those that kill are further apart than a batch is long: in one, the second would not begin.
+    Runs that kill are more than a batch apart, so that each starts.
     """
     fmu = changed_step(fmu_path, tmp_path, BEGUN)
     monkeypatch.setenv("BEGUN", str(tmp_path / "begun"))

@@ -58,7 +58,7 @@ def begin(fmu: Path, output: Path, *options: str) -> subprocess.Popen[str]:
 
 @pytest.fixture(scope="module")
 def undisturbed(native_path, tmp_path_factory):
-    """A sweep of 320 runs that nothing disturbs."""
+    """An undisturbed sweep of 320 runs."""
     path = tmp_path_factory.mktemp("sweep") / "whole"
     done = begin(native_path, path)
     out, err = done.communicate(timeout=120)
@@ -69,7 +69,7 @@ def undisturbed(native_path, tmp_path_factory):
 
 @pytest.mark.long
 def test_what_is_interrupted_is_resumed(native_path, undisturbed, tmp_path, length):
-    """By Ctrl-C to all processes of the terminal, or by the death of the sweep's own."""
+    """The interrupt is Ctrl-C to all processes of the terminal, or the death of the sweep's own process."""
     rng = random.Random(3)
     expected = table_of(undisturbed)
     kept = []
@@ -175,7 +175,7 @@ def of_one_text(table: pa.Table) -> pa.Table:
 
 
 def store(table: pa.Table, path: Path) -> None:
-    """As another writer does, which knows no dictionaries of Arrow's."""
+    """Write a table as another writer without Arrow's dictionaries does."""
     with pq.ParquetWriter(path, table.schema, store_schema=False) as writer:
         writer.add_key_value_metadata(table.schema.metadata)
         writer.write_table(table)
@@ -236,7 +236,7 @@ def test_hostile_table_gets_one_line_in_little_memory(sound, tmp_path, make):
 
 @pytest.mark.long
 def test_memory_of_the_coordinator_is_flat(native_path, tmp_path, length):
-    """Once pyarrow has written its first rows, for which it takes some 15 MiB."""
+    """It is measured after pyarrow has written its first rows, for which it takes some 15 MiB."""
     code = """
 import sys, twodof
 from pathlib import Path

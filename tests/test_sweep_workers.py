@@ -27,7 +27,7 @@ from twodof.sweeps.batches import MOST_DEATHS
 
 
 def doors(process: int) -> dict[str, str]:
-    """Return the kernel's list of its sockets that others could connect or send to, by inode."""
+    """Return the kernel's list of sockets to which others could connect or send, by inode."""
     own = set()
     for entry in Path(f"/proc/{process}/fd").iterdir():
         with suppress(OSError):
@@ -51,7 +51,7 @@ def started():
 
 
 def test_nobody_else_can_talk_to_workers(native_path, started):
-    """No socket has a port or a name, no other user can write where they read; one thread each."""
+    """No socket has a port or a name, no other user can write to their pipes, and each has one thread."""
     before, seen = doors(os.getpid()), {}
 
     def look(done: int, runs: int) -> None:
@@ -93,7 +93,7 @@ assert not {"dask", "distributed"} & {*sys.modules}
     ],
 )
 def test_workers_import_nothing_from_the_working_directory(way, variables, native_path, tmp_path):
-    """Nor the program itself, which shields nothing by ``if __name__ == "__main__"``."""
+    """They do not import the program either, even without ``if __name__ == "__main__"``."""
     (tmp_path / "program.py").write_text(PROGRAM)
     done = python(*way, Path(__file__).parent, native_path, cwd=tmp_path, env={**os.environ, **variables})
     assert (done.returncode, done.stderr) == (0, "")
@@ -101,7 +101,7 @@ def test_workers_import_nothing_from_the_working_directory(way, variables, nativ
 
 
 def test_workers_run_the_package_that_the_program_runs(native_path, tmp_path):
-    """Another one than is installed, in the working directory."""
+    """It is in the working directory, and differs from the installed one."""
     shutil.copytree(Path(twodof.__file__).parent, tmp_path / "twodof")
     with (tmp_path / "twodof/simulation/judge.py").open("a") as file:
         file.write("Judge.metrics = lambda judge: {'overshoot': 17.0}\n")
@@ -173,7 +173,7 @@ if self.Kp[0] == 4.0:
 
 @contextmanager
 def asleep(fmu_path: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """A sweep, in folder/s, whose third run takes days and has begun; and its workers."""
+    """A sweep, in folder/s, whose third run takes days and has started; and its workers."""
     fmu = changed_step(fmu_path, folder, SLEEP)
     grid = ["--grid", "Kp=2:6:5", "--stop-time", "0.05", "--workers", "1"]
     process = subprocess.Popen(
@@ -261,7 +261,7 @@ def cluster(folder: Path, workers: int, options: Sequence[str] = (), **environme
 
 
 def test_a_cluster_that_asks_for_keys(native_path, tmp_path, monkeypatch):
-    """By Dask's own configuration; who has none is not let in."""
+    """Dask's own configuration sets it; connections without a key are refused."""
     key, certificate = str(tmp_path / "key.pem"), str(tmp_path / "certificate.pem")
     request = ["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=cluster", "-days", "2"]
     command = [needs("openssl"), *request, "-keyout", key, "-out", certificate]
@@ -285,7 +285,7 @@ def test_a_cluster_that_asks_for_keys(native_path, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def two_workers(tmp_path_factory):
-    """Address and process of a scheduler, and a file in which runs are told that are begun."""
+    """Address and process of a scheduler, and a file that lists the started runs."""
     folder = tmp_path_factory.mktemp("cluster")
     variables = {"BEGUN": str(folder / "begun"), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
     with cluster(folder, 2, **variables) as (address, scheduler):
@@ -300,7 +300,7 @@ def test_a_cluster_gives_the_table_of_local_workers(native_path, two_workers):
 
 
 def test_a_run_that_kills_is_given_up_by_a_cluster(fmu_path, tmp_path, two_workers):
-    """And not what its worker has in hand beside it, of which Dask thinks no better."""
+    """Dask also suspects the other runs of its worker, which are not given up."""
     fmu = changed_step(fmu_path, tmp_path, BEGUN)
     address, _, begun = two_workers
     grid = {"Kp": [298.0, 299.0, 300.0, 301.0]}

@@ -36,12 +36,12 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture(scope="session")
 def pd() -> bytes:
-    """The controller of another maker."""
+    """A third-party controller."""
     return pd_fmu()
 
 
 def law(q: np.ndarray, v: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Return the effort of native/pd.c, with q_des and q multiplied."""
+    """Return the effort of native/pd.c, with scaled q_des and q."""
     return scale * 0.1 * (TARGET - q) - 0.01 * v
 
 
@@ -98,7 +98,7 @@ GIVEN = values("q_des[1] Real 0.3", "q_des[2] Real 0.2", "Kp Real 0.1", "Kd Real
 
 @pytest.mark.parametrize("order", ["plant pd", "pd plant"])
 def test_a_loop_is_that_of_its_controller_in_python(plant: bytes, pd: bytes, tmp_path: Path, order: str) -> None:
-    """An output that depends directly on inputs is of the same instant, whatever the order of components."""
+    """An output with direct feedthrough is of the same instant, in any order of components."""
     elements = "".join(component(name, binding(GIVEN) if name == "pd" else "") for name in order.split())
     structure = ssd(f"<ssd:Elements>{elements}</ssd:Elements><ssd:Connections>{WIRES}</ssd:Connections>")
     system = loop(tmp_path / "loop.ssp", plant, pd, structure)
@@ -125,7 +125,7 @@ def test_units_are_converted_and_not_where_that_is_suppressed(plant: bytes, tmp_
 
 
 def test_a_connector_may_repeat_the_unit_of_its_variable(plant: bytes, tmp_path: Path) -> None:
-    """In few digits, under another name, or without a definition; values have the unit of the FMU's variable."""
+    """It has few digits, another name, or no definition; values have the unit of the FMU's variable."""
     rounded = '<ssc:Unit name="degree"><ssc:BaseUnit rad="1" factor="0.0174533"/></ssc:Unit>'
     settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
     degrees, plain = pd_fmu(unit="deg", factor=np.pi / 180.0), ssd(f"{BOTH}<ssd:Connections>{WIRES}</ssd:Connections>")
@@ -140,7 +140,7 @@ def test_a_connector_may_repeat_the_unit_of_its_variable(plant: bytes, tmp_path:
 def test_what_is_probably_not_meant_gets_a_line(
     plant: bytes, pd: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A vector that is connected in part; a bare setting of the plant that the other FMU has too."""
+    """A vector is connected in part, or a setting of the plant without a component is also in the other FMU."""
     system = loop(tmp_path / "loop.ssp", plant, pd)
     twodof.experiment(system, settings=GAINS)
     assert not caplog.records
@@ -164,7 +164,7 @@ def test_what_is_probably_not_meant_gets_a_line(
 
 
 def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp_path: Path) -> None:
-    """Annotations, geometry, empty units and elements, unknown units, further kinds of connectors, SSP 2.0's number."""
+    """They have annotations, geometry, empty or unknown units, further kinds of connectors, or SSP 2.0's number."""
     note = '<ssd:Annotations><ssc:Annotation type="x"><o:Step xmlns:o="o" size="1"/></ssc:Annotation></ssd:Annotations>'
     where = '<ssc:Real unit=""/><ssd:ConnectorGeometry x="0" y="0.5"/>'
     extent = '<ssd:ElementGeometry x1="0" y1="0" x2="1" y2="1"/>'
@@ -280,7 +280,7 @@ def test_truth_values_are_connected(plant: bytes, pd: bytes, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("on", [True, False])
 def test_discrete_outputs_are_connected(plant: bytes, pd: bytes, tmp_path: Path, on: bool) -> None:
-    """The second controller takes from the first whether it is enabled, and the number of steps, until 20."""
+    """The second controller receives from the first a Boolean that enables it, and the number of steps, up to 20."""
     twin = component("pd").replace('name="pd"', 'name="twin"')
     wires = WIRES.replace('"pd"', '"twin"') + connection("pd.on", "twin.enabled") + connection("pd.steps", "twin.seen")
     elements = BOTH.replace("</ssd:Elements>", f"{twin}</ssd:Elements>")
@@ -341,7 +341,7 @@ def test_the_bag_of_a_system_names_its_fmus_and_info_draws_it(
 
 
 def test_signals_of_all_fmus_are_in_a_topic(plant: bytes, pd: bytes, tmp_path: Path) -> None:
-    """Named numbers, which PlotJuggler plots by name; in a robot's own FMU too."""
+    """They have names, by which PlotJuggler plots them; this includes a robot's own FMU."""
     system, bag = loop(tmp_path / "loop.ssp", plant, pd), tmp_path / "bag"
     given = [text for name, value in {**GAINS, "pd.q_des": "0.3,0.2"}.items() for text in ("--set", f"{name}={value}")]
     assert main(["run", str(system), "-o", str(bag), "--stop-time", "0.5", "--signals", "--scene", *given]) == 0
@@ -386,7 +386,7 @@ def test_of_several_robots_one_is_chosen(plant: bytes, pd: bytes, tmp_path: Path
 
 
 def crossed(unit: str = 'suppressUnitConversion="true"') -> bytes:
-    """Return a structure in which two controllers feed each other."""
+    """Return a structure in which two controllers are connected in a loop."""
     twin = component("pd").replace('name="pd"', 'name="twin"')
     wires = WIRES + connection("pd.tau[1]", "twin.q[1]", more=unit)
     wires = wires.replace(connection("plant.q[1]", "pd.q[1]"), connection("twin.tau[1]", "pd.q[1]", more=unit))

@@ -15,7 +15,7 @@ ESCAPES = "\x1b[31mred\x1b[0m‮reversed⁦"
 
 
 def run(*arguments: str | bytes, cwd: Path, shell: str = '"$@"', **variables: str) -> subprocess.CompletedProcess[str]:
-    """A command behind a shell, which may close its streams."""
+    """Run a command by a shell, which may close its streams."""
     return subprocess.run(
         ["sh", "-c", shell, "sh", *TWODOF, *arguments],
         cwd=cwd,
@@ -53,7 +53,7 @@ def test_a_sweep_whose_name_is_no_text_is_refused(verb, native_path, tmp_path):
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
 def test_streams_that_are_closed_end_no_run(closed, native_path, tmp_path):
-    """Nor is a file of the run taken for one of them."""
+    """No file of the run becomes one of them."""
     command = ["run", str(native_path), "--stop-time", "0.1", "-o", "bag"]
     assert run(*command, cwd=tmp_path, shell=f'"$@" {closed}').returncode == 0
     assert len(twodof.read_bag(tmp_path / "bag").t) == 11
@@ -67,7 +67,7 @@ def test_a_backend_of_matplotlib_that_is_not_here_ends_no_plot(backend, native_p
 
 
 def test_names_are_no_commands_to_the_terminal(native_path, tmp_path):
-    """In what to type next, in warnings of matplotlib, and in errors of the command line."""
+    """This includes suggested commands, warnings of matplotlib, and errors of the command line."""
     name = f"bag {ESCAPES}"
     command = ["run", str(native_path), "--stop-time", "0.1", "-o", name]
     ran = run(*command, cwd=tmp_path)

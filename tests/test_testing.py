@@ -1,4 +1,4 @@
-"""The pytest plugin and its assertions, in runs of pytest of their own."""
+"""The pytest plugin and its assertions, in separate runs of pytest."""
 
 import dataclasses
 import os
@@ -32,7 +32,7 @@ def test_a_run_that_is_as_asserted_passes(runs):
 
 
 def test_settling_is_that_of_the_error(runs):
-    """The time in the message is the last sample at which the distance exceeds 2 % of the first."""
+    """The time in the message is that of the last sample whose distance exceeds 2 % of the first."""
     bag = twodof.read_bag(runs["good"])
     distance = ((bag.x - (0.2, 0.05)) ** 2).sum(axis=1) ** 0.5
     outside = bag.t[distance > 0.02 * distance[0]][-1]
@@ -65,7 +65,7 @@ def test_a_deviation_is_named_with_its_time(runs):
 
 
 def test_what_cannot_be_compared_fails(runs):
-    """A run without limits, a target or equal samples is not as asserted."""
+    """A run without limits, a target or equal samples fails the assertion."""
     good = twodof.read_bag(runs["good"])
     unknown = dataclasses.replace(good, provenance={})
     shorter = dataclasses.replace(good, stamps=good.stamps[:-1], q=good.q[:-1], v=good.v[:-1])

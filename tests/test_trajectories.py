@@ -1,7 +1,7 @@
 """Trajectories of a bag, followed by an arm under joint control.
 
-Truths are SciPy's splines, and the exact answer of
-q̈ = c − Kd q̇ − Kp q to what is held over a step; the bags are rosbags' with its own definitions.
+The references are SciPy's splines, and the exact response of q̈ = c − Kd q̇ − Kp q to inputs held over a step. rosbags
+writes the bags with its own definitions.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ def trajectory(points: Sequence[Point], names: Sequence[str] = NAMES, stamp: int
 
 
 def write(path: Path, *commands: tuple[float, Any], topic: str = "/go") -> Path:
-    """A bag whose first joint state is at BEGIN, and messages so many seconds after."""
+    """Write a bag whose first joint state is at BEGIN, with messages some seconds after."""
     header = HUMBLE.types["std_msgs/msg/Header"](HUMBLE.types["builtin_interfaces/msg/Time"](0, 0), "")
     none = np.zeros(0)
     state = HUMBLE.types[JOINT_STATE](header, [], none, none, none)
@@ -88,14 +88,14 @@ BACK = ((0.2, 0.5), (0.0, 0.0), (0.0, 0.0))
 
 
 def spline(times: Sequence[float], points: Sequence[Any]) -> BPoly:
-    """By SciPy, through points whose parts are given."""
+    """Return the spline by SciPy, through points with given parts."""
     orders = [2 * min(len(a), len(b)) - 1 for a, b in pairwise(points)]
     return BPoly.from_derivatives(times, [np.array(p, float) for p in points], orders)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
 def test_what_is_held_is_the_mean_of_a_spline(arm, tmp_path, parts):
-    """From rest, through three points at times of no step, to rest."""
+    """It goes from rest, through three points between communication points, to rest."""
     knots = [0.0, 0.333, 0.7, 1.111]
     numbers = np.random.default_rng(parts).normal(size=(4, 3, 2))
     numbers[0] = np.array([START, (0, 0), (0, 0)])
@@ -118,7 +118,7 @@ def test_what_is_held_is_the_mean_of_a_spline(arm, tmp_path, parts):
 
 
 def test_the_robot_does_exactly_what_is_held(arm, tmp_path):
-    """From off the trajectory, at each step, by ë + Kd ė + Kp e = c, which is constant in it."""
+    """It starts off the trajectory; in each step ë + Kd ė + Kp e = c with constant c."""
     bag = write(tmp_path / "bag", (0.0, trajectory([(0.0, *THERE), (1.0, *BACK), (1.5, *THERE)])))
     out, h = tmp_path / "model", 0.01
     options = ["--stop-time", "2", "--set", "q_start=0.7,0.2"]
@@ -142,7 +142,7 @@ def test_the_robot_does_exactly_what_is_held(arm, tmp_path):
 
 
 def test_the_robot_stays_on_the_trajectory(arm, tmp_path):
-    """As what is held comes closer to what is wanted, with the square of the step."""
+    """The deviation falls with the square of the step."""
     near = ((0.52, 0.34), (0.0, 0.0), (0.0, 0.0))
     rest = (START, (0.0, 0.0), (0.0, 0.0))
     path = spline([0.0, 1.0], [rest, near])
@@ -160,7 +160,7 @@ def test_the_robot_stays_on_the_trajectory(arm, tmp_path):
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
 def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(arm, tmp_path, parts):
-    """In its joints alone; between two points by what both have."""
+    """It replaces only its joints; two points are joined by the fields of both."""
     stops = [(START, (0.0, 0.0), (0.0, 0.0)), THERE, BACK, THERE, BACK, THERE, BACK]
     first = trajectory([(t, *stop) for t, stop in zip((1.0, 1.6, 1.7, 1.8, 1.9, 2.0), stops[1:])])
     goals = [((0.3,), (-0.2,), (0.5,))[:parts], ((0.4,), (0.0,), (0.0,))]
@@ -213,7 +213,7 @@ def test_it_begins_where_the_run_does(arm, tmp_path):
 
 
 def test_joints_of_another_robot_are_left_out(arm, tmp_path, caplog):
-    """Both a trajectory and a joint state may name them."""
+    """A trajectory and a joint state may name them."""
     names, none = ["finger", "joint2", "elbow"], np.zeros(0)
     message = trajectory([(1.0, (0.1, 0.2, 0.3), (0.0, 0.5, 1.0))], names)
     state = HUMBLE.types[JOINT_STATE](message.header, names, np.array([0.1, 0.2, 0.3]), none, none)

@@ -29,7 +29,7 @@ def panda_file(robots: Path) -> Path:
 
 @pytest.mark.parametrize("locks", [{"panda_joint7": 0.7}, {"panda_joint[24]": -0.5}, {"*": 0.0, "panda_joint4": -1.0}])
 def test_locked_joints_are_pinocchios_reduced_model(panda_file: Path, locks: dict[str, float]) -> None:
-    """M, h and the frame's place; the fingers, one of which mimics the other, are always locked."""
+    """M, h and the frame's position agree; the fingers, one of which mimics the other, are always locked."""
     text = panda_file.read_text()
     full = pin.buildModelFromXML(text)
     positions = {"panda_finger_joint?": 0.02}
@@ -132,7 +132,7 @@ def test_inertias_that_no_body_has_are_named_in_one_line() -> None:
 def test_a_urdf_is_run_by_one_command(
     robots: Path, panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They have one end, which is controlled; for others `build` takes what one needs to say."""
+    """They have one last link, which is controlled; for others, `build` names the missing option."""
     monkeypatch.chdir(tmp_path)
     xarm = robots / "xarm_description/urdf/xarm7.urdf"
     assert main(["run", str(xarm), "-o", "bag", "--stop-time", "0.1"]) == 0
@@ -146,7 +146,7 @@ def test_a_urdf_is_run_by_one_command(
 def test_a_urdf_of_several_ends_is_run_by_one_command_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The remedy of its refusal is an option that there is."""
+    """The option in the message exists."""
     monkeypatch.chdir(tmp_path)
     arm = without_meshes(data_file("urdf", "2dof.urdf").read_text()).replace("EndEffector", "tip")
     side = '<link name="side"/><joint name="fork" type="fixed"><parent link="link1"/>'
@@ -179,7 +179,7 @@ BALL = """<robot name="top"><link name="base"/><link name="a"/><link name="b"/><
 
 @pytest.mark.parametrize("native", [False, True], ids=["python", "native"])
 def test_links_without_mass_make_a_ball_joint(native: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A body that turns about its centre without torque keeps its angular momentum."""
+    """A body that rotates about its centre without torque keeps its angular momentum."""
     (tmp_path / "top.urdf").write_text(BALL)
     options = FmuOptions(urdf=tmp_path / "top.urdf", control="effort", native=native)
     fmu = build_fmu(tmp_path / "top.fmu", options)

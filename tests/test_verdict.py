@@ -69,7 +69,7 @@ def test_the_first_line_names_the_cause_of_a_failure(failed: Failed) -> None:
 
 
 def test_the_page_names_the_same_causes_in_the_same_order(failed: Failed) -> None:
-    """For the same samples; the root cause concerns the same joint. A run in a page goes on: 5 s more are not slow."""
+    """The samples are the same. A run in a page continues, so that an error that shrinks for 5 s more is not slow."""
     found = page_causes(failed.kept.run, failed.kept.samples)
     expected = [c.kind for c in failed.verdict.causes if c.kind != "time" or c.share > 5.0]
     kinds = [[*dict.fromkeys(each)] for each in ([c["kind"] for c in found], expected)]
@@ -93,7 +93,7 @@ def test_the_page_names_the_same_causes_in_the_same_order(failed: Failed) -> Non
     ],
 )
 def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], same: dict[str, Any]) -> None:
-    """And without another cause that the verdict might name first, it still fails."""
+    """Without another cause that the verdict might name first, it still fails."""
     failure = FAILURES[name]
     settings = [{**failure.settings, **change} for change in (cured, same)]
     outcomes = [failures.run(failure._replace(settings=each)).verdict.outcome for each in settings]
@@ -135,7 +135,7 @@ def test_an_arm_that_stops_short_of_the_nearest_point_says_so() -> None:
 
 
 def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:
-    """While the damping of a Panda's joints, which the controller does not know, disturbs it."""
+    """The damping of a Panda's joints, which the controller does not know, disturbs it."""
     settings = {"x_des": (0.4, 0.2, 0.6), **failures.LARGE_STEPS}
     kept = Kept()
     verdict = twodof.simulate(fmu_of("panda", "pose"), kept, settings=settings, stop_time=4.0).verdict
@@ -228,7 +228,7 @@ def test_motion_is_steady_oscillating_or_diverging(rate: float, motion: str) -> 
 
 @pytest.mark.parametrize("target", [(0.5, 0.1), (0.02, -0.01), (-0.4, 0.3), (0.1, -0.28)])
 def test_the_nearest_point_is_that_of_another_optimiser(target: tuple[float, float]) -> None:
-    """Within limits that cut the ring of the default arm; SciPy's grid search and Nelder and Mead's simplex."""
+    """Limits cut the ring of the default arm; the optimisers are SciPy's grid search and Nelder and Mead's simplex."""
     urdf = read_urdf((Path(__file__).parents[1] / "urdf/2dof.urdf").read_text())
     low, high = np.array([-0.5, 0.2]), np.array([2.0, 2.5])
 
@@ -263,7 +263,7 @@ def test_the_nearest_point_of_a_panda_is_that_of_an_evolution() -> None:
 
 
 def test_the_verdict_calls_no_function_for_each_sample(native_path: Path) -> None:
-    """A sample costs the writing of its row; the calls of a block do not depend on its size."""
+    """A sample costs only the writing of its row; the number of calls does not depend on the block size."""
     run = twodof.experiment(native_path, stop_time=1000.0)
     judge = master.judge_of(run, None)
     row = memoryview(bytes(8 * sum(len(run.fmu.vector(group)) for group in OUTPUTS)))
@@ -297,7 +297,7 @@ def test_the_verdict_takes_no_more_memory_in_a_longer_run(native_path: Path) -> 
 
 
 def test_blocks_change_no_number(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With targets that change within blocks and at their edges."""
+    """Targets change within blocks and at their edges."""
     changes = [(0.1 * k, {"x_des": (0.2 + 0.002 * k, 0.05)}) for k in range(1, 12)]
     expected = twodof.simulate(native_path, stop_time=6.0, changes=changes, settings={"Kd": 6.0}).verdict
     for block in (1, 7, 10, 50):
@@ -363,7 +363,7 @@ def test_a_run_without_a_target_says_so() -> None:
 
 
 def test_gains_of_a_controller_outside_that_the_step_shows() -> None:
-    """A proportional and derivative controller, sampled every 10 ms, at the edge of what that step bears."""
+    """A PD controller, sampled every 10 ms, is at its stability limit."""
     run = twodof.experiment(fmu_of("arm", "effort"), step=0.01, stop_time=1.0, settings={"gravity": (0.0, 0.0, 0.0)})
     steps, samples = twodof.samples(run), []
     samples.append(next(steps))
@@ -376,7 +376,7 @@ def test_gains_of_a_controller_outside_that_the_step_shows() -> None:
 
 
 def test_a_bag_whose_writer_died_is_judged_by_its_samples(native_path: Path, tmp_path: Path) -> None:
-    """And one whose messages are fewer than its verdict says."""
+    """This includes a bag with fewer messages than its verdict states."""
     run, kept = twodof.experiment(native_path, stop_time=5.0), []
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for sample in twodof.samples(run):
@@ -409,7 +409,7 @@ def test_a_judge_of_nothing_has_no_number() -> None:
 
 
 def test_a_joint_sticks_from_its_last_motion_on() -> None:
-    """A joint that moves at first and is then held short of its target: from the sample at which its speed is 0."""
+    """A joint moves at first and then sticks before its target: it sticks from the first sample with speed 0."""
     fmu = fmu_of("arm", "joint")
     settings = {"q_des": (0.9, 0.35), "friction": (0.03, 0.0), "Kp": 20.0, "Kd": 2.0, "max_step": 0.01}
     kept = Kept()

@@ -1,4 +1,4 @@
-"""The replay of a bag in a browser, compared with the bag as MCAP's own reader reads it."""
+"""The replay of a bag in a browser, compared with the bag in MCAP's own reader."""
 
 import json
 import logging
@@ -92,7 +92,7 @@ def truth(folder):
 
 
 def pause(page: Page) -> None:
-    """Press the button if it is there: found and pressed in one go, as the bag may end between."""
+    """Press the button if it exists; search and press are one call, because the replay may end between."""
     page.evaluate(
         "() => [...document.querySelectorAll('button')]"
         ".find((button) => button.textContent.trim() === 'Pause')?.click()"
@@ -101,7 +101,7 @@ def pause(page: Page) -> None:
 
 
 def scrub(page: Page, time: float) -> dict[str, str]:
-    """Return the page's text after its slider was moved."""
+    """Return the page's text after moving its slider."""
     page.get_by_label("time, s").evaluate(
         "(slider, t) => { slider.value = t; slider.dispatchEvent(new Event('input')); }", f"{time}"
     )
@@ -179,7 +179,7 @@ def test_the_view_is_brought_back(page):
 
 
 def test_speed_is_that_of_the_wall_clock(page, speed=0.25):
-    """Told from those of half and of twice as much, once a busy machine shows it in time."""
+    """It is distinguished from half and twice that speed, once a busy machine shows the page in time."""
     page.get_by_label("speed").select_option(f"{speed:g}")
     shown: list[float] = []
     while not shown or not 0.7 < shown[-1] < 1.4:
@@ -239,7 +239,7 @@ def test_nearest_is_nearest(page, truth, times):
 
 
 def test_twenty_visits_leak_nothing(command, page):
-    """Threads and memory are as they were after the first few."""
+    """Threads and memory equal those after the first visits."""
     for i in range(25):
         assert answer(command.url, ("Host", "localhost")) == 200
         if i == 4:
@@ -249,7 +249,7 @@ def test_twenty_visits_leak_nothing(command, page):
 
 
 def test_exported_file_replays_offline(shown, folder, truth, run_view):
-    """Each picture is the arm at that moment of the bag; and it is all of the page."""
+    """Each picture shows the arm at its time in the bag; the file is the whole page."""
     done = run_view("bag", "--export", "replay.html", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
     file = folder / "replay.html"
@@ -289,10 +289,9 @@ def test_exported_file_replays_offline(shown, folder, truth, run_view):
 
 
 def assert_on_one_arm(system: np.ndarray, middles: np.ndarray) -> None:
-    """The second link's middle is where the first one leads, and no mirror image of that.
+    """Assert that the middle of the second link is where the first one leads, and not its mirror image.
 
-    Where the root is in the picture, how large that is, and where on the link its middle is, is
-    fitted: it does not change.
+    Position and scale of the root in the picture, and the position of the middle on the link, are constant and fitted.
     """
     fitted, *_ = np.linalg.lstsq(system, middles, rcond=None)
     assert min(fitted[2:]) > 0.0 and np.abs(system @ fitted - middles).max() < 1.5  # pixels
@@ -324,7 +323,7 @@ View = Callable[..., Done]
 
 @pytest.fixture
 def run_view(monkeypatch, capsys):
-    """``twodof view`` in a folder."""
+    """Run ``twodof view`` in a folder."""
 
     def run(*arguments: str | Path, cwd: Path) -> Done:
         monkeypatch.chdir(cwd)
@@ -337,7 +336,7 @@ def run_view(monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def painted(folder):
-    """A folder with the bag of a robot whose meshes, magenta, are elsewhere."""
+    """A folder with the bag of a robot whose magenta meshes are elsewhere."""
     root = Path(__file__).parents[1]
     shutil.copytree(root / "meshes", folder / "packages/painted")
     urdf = (root / "urdf/2dof.urdf").read_text().replace("package://meshes/", "package://painted/")
@@ -383,7 +382,7 @@ def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted, run_view):
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory):
-    """A bag all of whose texts are hostile."""
+    """A bag with hostile texts only."""
     folder, robot = tmp_path_factory.mktemp("hostile"), browser.hostile_arm()
     (folder / "arm.urdf").write_bytes(ET.tostring(robot))
     frame = browser.HOSTILE + "EndEffector"

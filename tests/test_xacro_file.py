@@ -1,4 +1,4 @@
-"""Xacro files: expanded as by xacro, in a process that can only read the file's own folders."""
+"""Xacro files: expanded as xacro does, in a process that can read only the file's own folders."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ SIZES = "length: !millimeters 300\nmass: [3, 2.5, 1]\nnames: [upper, lower, hand
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A package, in a folder of another name, beside a file that nobody may read."""
+    """A package in a folder with another name, next to a file that must not be read."""
     folder = tmp_path / "checkout"
     for name, text in {
         "package.xml": "<package><name>my_robot</name></package>",
@@ -65,7 +65,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def test_what_comes_out_is_xacros_own(package: Path) -> None:
-    """Includes, namespaces, arguments, YAML with units, conditions, blocks, a macro that recurs."""
+    """Includes, namespaces, arguments, YAML with units, conditions, blocks, a recursive macro."""
     path = package / "urdf/arm.urdf.xacro"
     free = path.with_name("free.xacro")
     free.write_text(ROBOT.replace("$(find my_robot)", str(package)), "utf-8")

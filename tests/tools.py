@@ -1,6 +1,6 @@
 """Programs that some tests need and that pip does not install: one table.
 
-``python3 tests/tools.py`` prints the Debian packages of those that are missing.
+``python3 tests/tools.py`` prints the Debian packages of missing programs.
 """
 
 from __future__ import annotations
