@@ -88,7 +88,7 @@ def room(path: Path) -> str:
     return parts[1] if parts[0] == "twodof" else parts[0]
 
 
-def test_a_room_imports_those_before_it_alone():
+def test_a_room_imports_only_rooms_above_it():
     order = list(ROOMS)
     inside = {path for path in PYTHON if path.parts[0] == "twodof"}
     assert {room(path) for path in inside} == {*order, "__init__", "__main__"}
@@ -108,7 +108,7 @@ def test_rooms_import_few_others():
     assert len(arrows) <= MOST_ARROWS
 
 
-def test_modules_import_each_other_in_no_circle():
+def test_modules_have_no_import_cycle():
     modules = {".".join(path.with_suffix("").parts): path for path in PYTHON}
     graph = {}
     for module, path in modules.items():
@@ -117,7 +117,7 @@ def test_modules_import_each_other_in_no_circle():
     assert [*TopologicalSorter(graph).static_order()]  # which raises CycleError
 
 
-def test_a_foreign_library_is_in_its_room_alone():
+def test_a_third_party_library_is_imported_only_in_its_room():
     rooms: dict[str, set[str]] = {library: set() for library in LIBRARIES}
     for path in PYTHON:
         for library in {name.partition(".")[0] for name in imported(path)} & LIBRARIES.keys():
@@ -125,7 +125,7 @@ def test_a_foreign_library_is_in_its_room_alone():
     assert rooms == LIBRARIES
 
 
-def test_nothing_is_longer_than_can_be_read():
+def test_files_functions_and_lines_are_short():
     sources = [p for kind in ("*.[ch]", "*.js") for p in (ROOT / "fmu_src").rglob(kind)]
     sources += (ROOT / "twodof").rglob("*.js")
     files = [*PYTHON, *(path.relative_to(ROOT) for path in sources)]
@@ -139,7 +139,7 @@ def test_nothing_is_longer_than_can_be_read():
     assert not long
 
 
-def test_the_package_has_few_files_beside_its_rooms():
+def test_the_package_has_few_files_outside_of_its_rooms():
     files = {path.name for path in (ROOT / "twodof").glob("*.py")}
     assert len(files) <= MOST_FILES
 

@@ -100,7 +100,7 @@ class Pause(twodof.Sink):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_the_bytes_that_are_reproducible_are_those_of_the_docs(storage, native_path, tmp_path, monkeypatch):
+def test_reproducible_bytes_are_as_documented(storage, native_path, tmp_path, monkeypatch):
     """More flushes change only the storage file."""
     bags = []
     for name, period in (("seldom", 60.0), ("often", 0.01)):
@@ -344,7 +344,7 @@ def joint_states_of_another_writer(rng: np.random.Generator) -> Iterator[tuple[i
         yield k * SECOND, bytes(data)
 
 
-def test_joint_states_are_read_as_rosbags_reads_them_in_whatever_form(tmp_path):
+def test_joint_states_of_any_form_are_read_as_by_rosbags(tmp_path):
     kind = "sensor_msgs/msg/JointState"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/joint_states", kind, typestore=STORE)
@@ -369,7 +369,7 @@ def test_bag_without_joint_states_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "folder", "file", "nonsense"])
-def test_what_is_no_bag_is_refused(tmp_path, content):
+def test_a_path_that_is_not_a_bag_is_refused(tmp_path, content):
     path = tmp_path / "bag"
     if content == "file":
         path.write_text("hello")

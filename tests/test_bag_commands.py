@@ -138,7 +138,7 @@ def test_what_cannot_be_replayed(effort, tmp_path, capfd, messages, topic, reaso
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("last", [np.nan, np.inf])
-def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(tmp_path, capfd, last):
+def test_no_difference_is_printed_for_values_that_are_not_finite(tmp_path, capfd, last):
     """NumPy gives no warning either."""
 
     def bag(name: str, last: float) -> str:
@@ -158,7 +158,7 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(tmp_path, capf
     assert said in capfd.readouterr().out
 
 
-def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path, capfd):
+def test_a_plot_of_two_bags_prints_their_largest_difference(tmp_path, capfd):
     """They have other sampling times, and different durations."""
 
     def bag(name: str, count: int, step: int, off: float) -> str:

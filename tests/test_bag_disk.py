@@ -49,7 +49,7 @@ def test_messages_are_on_the_disk_before_metadata_says_that_they_are(native_path
     assert whole < told.index((str(bag / "metadata.yaml"), 0))
 
 
-def test_a_foreign_lock_is_not_waited_for_without_end(native_path, tmp_path, monkeypatch):
+def test_the_wait_for_a_foreign_lock_is_bounded(native_path, tmp_path, monkeypatch):
     """Another program locks each new folder."""
     monkeypatch.setattr("twodof.files.LOCK_TIMEOUT", 0.1)
     mkdir, held = Path.mkdir, []

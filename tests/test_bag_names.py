@@ -26,7 +26,7 @@ def renamed(bag: Path, name: bytes) -> Path:
     ("storage", "name"),
     [("mcap", b"\xff"), ("mcap", b"a?b"), *[("sqlite3", name) for name in (b"\xff", b"a?b", b"a%41")]],
 )
-def test_bag_of_a_name_that_none_would_find_again_is_refused(run, tmp_path, storage, name):
+def test_a_bag_name_that_readers_cannot_open_is_refused(run, tmp_path, storage, name):
     bag = renamed(unfinished(tmp_path, run, storage, 10), name)
     before = content(tmp_path)
     if storage == "mcap" and name != b"\xff":

@@ -45,7 +45,7 @@ HERE = Path(__file__).parent
 
 
 @pytest.mark.parametrize("moment", ["rename", "open", "add_connection"])
-def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(run, tmp_path, moment, monkeypatch):
+def test_one_of_two_simultaneous_overwrites_is_refused(run, tmp_path, moment, monkeypatch):
     """The second starts just before the first renames the old bag, opens its own, or adds a topic."""
     path = tmp_path / "bag"
     with twodof.Bag(path).begin(run):
@@ -176,7 +176,7 @@ def test_a_bag_that_a_killed_run_has_renamed_is_named_and_later_removed(run, tmp
     assert notes.exists() and assert_consistent(path, "mcap") == 3
 
 
-def test_bag_is_locked_though_another_looks_whether_it_is(run, tmp_path, monkeypatch):
+def test_a_bag_is_locked_while_another_process_checks_its_lock(run, tmp_path, monkeypatch):
     opened = BagWriter.open
 
     def looked_at(writer: BagWriter) -> None:
@@ -200,7 +200,7 @@ def test_bag_is_locked_though_another_looks_whether_it_is(run, tmp_path, monkeyp
     ],
     ids=["empty", "other files", "another run.json", "another metadata.yaml"],
 )
-def test_what_is_no_bag_is_never_overwritten(tmp_path, files):
+def test_a_path_that_is_not_a_bag_is_never_overwritten(tmp_path, files):
     """It is a folder, or a file."""
     path = tmp_path / "folder"
     path.mkdir()
@@ -224,7 +224,7 @@ def test_folder_that_appears_before_the_first_sample_is_kept(run, tmp_path, over
 
 
 @both_storages
-def test_a_link_stays_and_the_bag_behind_it_is_written(run, tmp_path, storage):
+def test_a_link_stays_and_its_target_is_written(run, tmp_path, storage):
     """The bag is new, or replaces another."""
     link, path = tmp_path / "link", tmp_path / "far" / "bag"
     path.parent.mkdir()
@@ -340,7 +340,7 @@ def test_reserve_is_room_to_close_a_run_that_was_never_flushed(run, disk, monkey
 
 
 @both_storages
-def test_messages_reach_the_disk_while_the_fmu_takes_its_time(run, tmp_path, storage):
+def test_messages_reach_the_disk_during_a_long_step(run, tmp_path, storage):
     """They are fewer than fill a buffer, and no more arrive."""
     with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         for k in range(50):

@@ -16,7 +16,7 @@ EVERY_ROBOT = ("twodof", *ROBOTS)
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)
-def test_bare_plant_is_pinocchios(name, length):
+def test_the_bare_plant_agrees_with_pinocchio(name, length):
     """q̈ with efforts, a force at the frame, damping and a payload, in both flavours."""
     native, rng = engine(name, "effort"), np.random.default_rng(1)
     for _ in range(length(1000, 30)):
@@ -55,7 +55,7 @@ MUJOCO = (
 
 
 @pytest.mark.parametrize("name", MUJOCO)
-def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
+def test_the_bare_plant_agrees_with_mujoco(name, length, tmp_path, monkeypatch):
     """MuJoCo's inverse dynamics of our q̈, with damping, returns the applied efforts.
 
     Without mimic joints, its q̈ equals ours.

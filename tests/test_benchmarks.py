@@ -38,7 +38,7 @@ def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmarks):
     np.testing.assert_allclose(e[1], e[0] * (fast * b - slow * a) / (fast - slow), rtol=1e-13)
 
 
-def test_listing_is_off_by_centimetres_and_an_fmu_is_not(benchmarks, native_path, tmp_path):
+def test_the_listing_deviates_by_centimetres_and_the_fmu_does_not(benchmarks, native_path, tmp_path):
     steps = benchmarks.steps
     assert 0.035 <= steps.accuracy(steps.Listing()) <= 0.055
     fmu = steps.FmuInFmpy(native_path, tmp_path, outputs=True)

@@ -45,7 +45,7 @@ def random_tree(rng):
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
+def test_dynamics_agree_with_pinocchio_for_any_axes(seed):
     rng = np.random.default_rng(seed)
     robot = load_robot(random_tree(rng), "end", "xyz")
     constants, n = joint_tree(robot), len(robot.joints)

@@ -268,7 +268,7 @@ def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_fmu_holds_no_file_that_is_none_of_the_robots(tmp_path):
+def test_an_fmu_contains_only_files_of_its_robot(tmp_path):
     urdf, uri = tmp_path / "in/arm.urdf", "package://etc/passwd"
     urdf.parent.mkdir()
     urdf.write_text(SHAPES.sub(f"<mesh filename='{uri}'/>", data_file("urdf", "2dof.urdf").read_text()))
@@ -277,14 +277,14 @@ def test_an_fmu_holds_no_file_that_is_none_of_the_robots(tmp_path):
     assert list(tmp_path.iterdir()) == [urdf.parent]
 
 
-def test_what_is_compiled_is_said(tmp_path, caplog):
+def test_compilation_is_logged(tmp_path, caplog):
     needs("ziglang")
     caplog.set_level("INFO", "twodof.export")
     build_fmu(tmp_path / "TwoDof.fmu", FmuOptions(native=True))
     assert set(caplog.messages) == {f"compiling for {host_platform()}"}
 
 
-def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
+def test_ignored_elements_of_a_urdf_are_reported(tmp_path, caplog):
     urdf = tmp_path / "rough.urdf"
     text = SHAPES.sub("<sphere radius='0.01'/>", data_file("urdf", "2dof.urdf").read_text())
     text = text.replace("<limit ", '<dynamics friction="0.3"/><limit ', 1)

@@ -152,7 +152,7 @@ def test_an_undeclared_dependency_fails(tmp_path: Path) -> None:
     assert texts == {"inputs": "y depends on u, and its InitialUnknown does not declare it"}
 
 
-def test_what_the_description_does_not_claim_does_not_apply(tmp_path: Path) -> None:
+def test_a_row_without_a_claimed_feature_does_not_apply(tmp_path: Path) -> None:
     described = DESCRIPTION
     for claim in ("canHandleVariableCommunicationStepSize", "canGetAndSetFMUstate", "canSerializeFMUstate"):
         described = described.replace(f'{claim}="true"', "")

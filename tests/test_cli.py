@@ -204,7 +204,7 @@ def test_what_the_fmu_refuses_is_one_line_and_leaves_no_bag(folder):
     assert [path.name for path in folder.iterdir()] == ["arm.fmu"]
 
 
-def test_controls_are_told_in_the_words_of_the_options(folder, capfd):
+def test_control_laws_are_named_as_in_the_options(folder, capfd):
     assert main([*RUN, "--set", "quat_des=1"]) == 1
     told = "it belongs to control 'task --orientation'; this FMU has control 'task'\n"
     assert capfd.readouterr().err.endswith(told)
@@ -259,7 +259,7 @@ def redirected(arguments: str, redirect: str, folder: Path, unbuffered: str = ""
 
 
 @pytest.mark.parametrize("verb", ["", *(verb.__name__.rpartition(".")[2] for verb in VERBS)])
-def test_help_is_told_in_two_ways(verb, capsys):
+def test_help_is_printed_by_verb_and_option(verb, capsys):
     assert main(["help", verb] if verb else ["help"]) == 0
     out = capsys.readouterr().out
     with pytest.raises(SystemExit) as end:
@@ -336,7 +336,7 @@ def test_the_examples_of_each_help_are_commands(verb):
         assert f"  {line}\n" in verbs.get(verb, program).format_help()
 
 
-def test_a_compiler_that_works_is_seen_working(tmp_path):
+def test_compilation_shows_progress(tmp_path):
     """A line appears within a second, counts seconds on a terminal, and is cleared at the end."""
     code = "import time; from twodof.cli.printing import busy\nwith busy('compiling'): time.sleep(1.7)"
     done = python("-c", code, env=ENVIRONMENT, check=True)

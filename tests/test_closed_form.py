@@ -94,7 +94,7 @@ def test_small_errors_keep_their_digits() -> None:
 
 
 @pytest.mark.parametrize("Kp", [1e-9, 1e-3, 1.0])
-def test_a_soft_spring_pulls_for_as_long_as_it_takes(Kp: float) -> None:
+def test_a_soft_spring_is_accurate_over_long_times(Kp: float) -> None:
     """Its root is Kp/Kd to first order, a difference of almost equal numbers."""
     Kd = 4e4
     t = np.array([Kd / Kp])
@@ -151,7 +151,7 @@ def test_at_a_change_the_error_is_still_that_from_the_target_before() -> None:
     assert (error[4:] < -4.0).all()
 
 
-def test_some_samples_have_the_error_that_they_have_among_all() -> None:
+def test_a_subset_of_samples_has_the_same_errors() -> None:
     """The bag is recovered or downsampled; some intervals between changes have no sample."""
     steps = np.array([0, 1, 2, 69, 70, 72, 150, 151, 299])
     some, every = (task_error((0.23, 0.18), (0.4, -0.2), SCHEDULE, 0.01, k) for k in (steps, np.arange(300)))

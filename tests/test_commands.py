@@ -72,7 +72,7 @@ NAMES = ("joint1", "joint2")
         ("joint", bytes(MAX_COMMAND + 1), "bytes", f"it has {MAX_COMMAND + 1} bytes"),
     ],
 )
-def test_what_is_no_command(arm, control, cdr, kind, text):
+def test_invalid_commands(arm, control, cdr, kind, text):
     with pytest.raises(CommandError, match=text) as caught:
         Commands(arm(control)).read(JOINT_STATE, cdr)
     assert caught.value.kind == kind

@@ -111,7 +111,7 @@ def test_a_new_cache_is_for_its_user_alone(tmp_path, monkeypatch):
     assert compiler._kept(cache / "twodof" / "key") == b"content"
 
 
-def test_no_home_for_the_cache_is_told(monkeypatch, caplog):
+def test_a_missing_home_for_the_cache_is_reported(monkeypatch, caplog):
     for name in ("HOME", "XDG_CACHE_HOME", "ZIG_GLOBAL_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # a user without a name

@@ -74,7 +74,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("name", ATTEMPTS)
-def test_nothing_but_what_is_given(name, tmp_path):
+def test_a_confined_child_accesses_only_given_files(name, tmp_path):
     folder = tmp_path / "given"
     folder.mkdir()
     (folder / "mesh").write_bytes(b"mesh")

@@ -203,7 +203,7 @@ def test_flavours_are_equal_with_limits_of_all_kinds_and_a_force(fmus, control):
     assert (np.abs(rows[0] - rows[1]) / size).max() <= 1e-9
 
 
-def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
+def test_a_short_hop_does_not_depend_on_the_largest_step(fmus):
     """Joint 2 leaves its stop for 11 µs, at 0.9481 s."""
     rng = np.random.default_rng(1)
     torque, limit = rng.uniform(0.2, 2.0), 0.3 * rng.uniform(0.2, 2.0)
@@ -216,7 +216,7 @@ def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
     np.testing.assert_allclose(ends, [ends[0]] * 4, atol=1e-9)
 
 
-def test_two_stops_that_drive_off_each_other_come_to_rest():
+def test_mutual_impacts_of_two_stops_end():
     """They act like the feet of a rocking block; impacts in turn would never end."""
     of = engine("twodof", "effort")
     plant = of.model.plant()
@@ -234,7 +234,7 @@ def test_two_stops_that_drive_off_each_other_come_to_rest():
 # --- what an FMU has ---
 
 
-def test_a_pd_loop_outside_comes_near_the_one_inside(fmus):
+def test_an_external_pd_loop_converges_to_the_internal_one(fmus):
     """Halving the step halves the distance."""
     Kp, Kd, goal = 60.0, 14.0, np.array([0.9, -0.6])
     plant = model("twodof").plant()
@@ -353,13 +353,13 @@ def test_a_target_on_a_limit_does_not_chatter(fmus, side):
     np.testing.assert_allclose(other, q, atol=1e-9)
 
 
-def test_a_control_that_is_none_is_refused():
+def test_an_unknown_control_law_is_refused():
     with pytest.raises(twodof.TwoDofError, match="`control` 'velocity' is unknown; there are: task, pose, j"):
         build_fmu(None, FmuOptions(control="velocity"))
 
 
 @pytest.mark.parametrize("payload", [-1.0, float("nan")])
-def test_a_payload_that_is_none_is_refused(fmus, payload):
+def test_an_invalid_payload_is_refused(fmus, payload):
     for native in (False, True):
         with pytest.raises(twodof.TwoDofError, match="payload"):
             [*twodof.samples(fmus["task", native], settings={"payload": payload}, stop_time=0.01)]

@@ -90,7 +90,7 @@ def test_a_sampled_split_loop_is_the_whole(fmus: dict[str, Path], law: str, peri
         np.testing.assert_allclose(split, whole, rtol=0, atol=1e-12)
 
 
-def test_the_controller_knows_what_it_is_told(fmus: dict[str, Path]) -> None:
+def test_the_controller_may_know_the_payload(fmus: dict[str, Path]) -> None:
     """The plant's payload is known to the controller, or not."""
     for known in (False, True):
         loads = {"payload": 0.2, "payload_known": known}

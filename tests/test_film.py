@@ -88,7 +88,7 @@ def test_a_picture_is_the_end_of_the_run(bag, tmp_path):
     assert off[1] < 0.5 < off[0]
 
 
-def test_what_makes_no_film_is_said(bag, tmp_path, capsys, monkeypatch):
+def test_reasons_against_a_film_are_reported(bag, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     for name, more, words in (
         (".png", [], "the name of an export ends in .html, .mp4, .webp, .gif, .png"),

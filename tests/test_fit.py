@@ -100,7 +100,7 @@ def test_only_numbers_of_the_urdf_change(bag):
     assert after.count("<dynamics friction=") == 2
 
 
-def test_a_hidden_spring_is_said_with_its_joint(tmp_path):
+def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):
     q, effort = noisy(arm_motion(stiffness=[0.0, 0.1]))
     result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort), FREE, gravity=GRAVITY)
     assert not result.explains

@@ -84,7 +84,7 @@ def test_options_that_do_not_fit_a_flavour_are_refused(options, message, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_shipped_arm_s_file_is_known_by_what_it_was_made_of(tmp_path, monkeypatch):
+def test_the_shipped_arms_file_is_identified_by_its_inputs(tmp_path, monkeypatch):
     """No FMU is composed for that, unless options or sources differ, or the file is damaged."""
 
     class ComposedError(Exception):

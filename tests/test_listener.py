@@ -218,7 +218,7 @@ def test_a_controller_that_stalls_dies_and_returns(bare, tmp_path, number, liste
         np.testing.assert_allclose(np.diff(tau[k - 40 : k + 1], n=2, axis=0), 0.0, atol=1e-9)
 
 
-def test_commands_that_mean_nothing_or_are_absurd_end_no_run(bare, tmp_path, number, listen):
+def test_invalid_or_extreme_commands_end_no_run(bare, tmp_path, number, listen):
     """The former have one warning for each kind; a step with the latter is refused."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")

@@ -244,7 +244,7 @@ def test_who_gives_no_orders_is_not_listened_to(command, page):
     until(page, lambda found: found["time"] == "0.010 s")
 
 
-def test_a_flood_of_orders_stops_no_news(command, page):
+def test_a_flood_of_requests_does_not_delay_updates(command, page):
     """Other pages' requests are executed too, and so is its own last one."""
     with open_socket(socket_of(command)) as flood, open_socket(socket_of(command)) as other:
         other.send('["play", true]')
@@ -294,7 +294,7 @@ def test_a_setting_that_is_none_is_told_as_text(command, page):
     until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
 
 
-def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown, fmu_path, tmp_path):
+def test_a_slow_page_or_ctrl_c_does_not_damage_a_recording(shown, fmu_path, tmp_path):
     """In the Python flavour; the recording does not wait for a page that reads too slowly."""
     with served("live", fmu_path, cwd=tmp_path) as command:
         place = urlsplit(socket_of(command))
@@ -350,7 +350,7 @@ def socket_of(command: Served) -> str:
     return browser.socket_of(command.url)
 
 
-def test_who_has_no_token_is_refused(command):
+def test_a_request_without_the_token_is_refused(command):
     """Another user of this machine can reach the port."""
     token = urlsplit(command.url).query.removeprefix("token=")
     assert len(token) == 43

@@ -49,7 +49,7 @@ def test_orders_are_carried_out_in_turn(native_path, everything):
     assert news["rows"][-1][-2:] == target
 
 
-def test_there_are_no_news_of_a_run_without_a_sample(native_path):
+def test_a_run_without_samples_gives_no_updates(native_path):
     """A page requests updates all the time."""
     loop, ended, counts = loop_of(native_path), Event(), set()
 

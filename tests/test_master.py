@@ -175,7 +175,7 @@ def test_steering_holds_from_the_sample_on_that_it_answers(native_path):
     assert [s.inputs["x_des[1]"] for s in expected[3:5]] == [0.2, 0.1]
 
 
-def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
+def test_a_run_continues_at_rest_after_a_discarded_step(native_path):
     """The run continues like one that starts there with its target there."""
     recorder, fmu = Recorder(), twodof.load_fmu(native_path)
     reasons = []
@@ -361,7 +361,7 @@ def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
     ],
     ids=["simulate", "urdf", "page", "sweep"],
 )
-def test_what_was_read_of_an_fmu_is_not_said_of_another(tmp_path, native_path, monkeypatch, use):
+def test_facts_of_an_fmu_are_not_used_for_another(tmp_path, native_path, monkeypatch, use):
     """Two robots' URDFs have one name, or one is rebuilt meanwhile."""
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "arm.fmu"

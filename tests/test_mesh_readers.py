@@ -168,7 +168,7 @@ FORGED = {
 
 
 @pytest.mark.parametrize(("answers", "reason"), FORGED.values(), ids=FORGED)
-def test_answers_of_a_reader_in_the_power_of_its_file(answers, reason, monkeypatch, caplog):
+def test_forged_answers_of_a_reader_are_refused(answers, reason, monkeypatch, caplog):
     """Injected code may send any answer; a pickle would run code."""
     monkeypatch.setattr(meshes_module, "serve", forging(answers))
     with Meshes({"a.stl": STL}.get) as meshes:

@@ -381,7 +381,7 @@ def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains):
     assert words == ["arm at the start", "arm at the end", "path", "target", "reach 0.3 m"]
 
 
-def test_looks_are_different_and_their_colours_those_of_okabe_and_ito():
+def test_line_styles_differ_and_colours_are_those_of_okabe_and_ito():
     """Black, orange, sky blue, bluish green, blue, vermillion and reddish purple, as published."""
     found = [look[1:] for look in line_styles(map(str, range(28)))]
     assert len(set(found)) == 28

@@ -310,7 +310,7 @@ def test_a_urdf_that_is_wrong_is_named(urdf, options, message, tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_joint_at_infinity_is_nowhere(tmp_path):
+def test_a_joint_at_infinity_leaves_a_gap(tmp_path):
     """A revolute, prismatic or mimicked joint leaves a gap in the path and on the replay, without a warning."""
     (tmp_path / "arm.urdf").write_text(chain_urdf("zXy"))
     t, q, v = waves(3)

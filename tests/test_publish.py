@@ -43,7 +43,7 @@ TYPES = dict(
 )
 
 
-def test_another_makers_dds_hears_every_field_of_the_bag(native_path, tmp_path, number, listen, length):
+def test_fast_dds_receives_every_field_of_the_bag(native_path, tmp_path, number, listen, length):
     """Names, types and type hashes are those of ROS 2; stamps are those of the wall clock."""
     seconds, before = length(60, 2), 4  # in which a busy machine finds the node
     node = listen(*STREAMS, *LATCHED)
@@ -134,7 +134,7 @@ def test_a_point_is_the_target_within_two_steps(native_path, tmp_path, number, l
             sample = run.send(told.get(sample.k))
 
 
-def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(native_path, tmp_path, number, listen):
+def test_invalid_or_unreachable_points_end_no_run(native_path, tmp_path, number, listen):
     """The robot stops, and follows the next valid target; there is one warning for each kind."""
     node = listen("/joint_states", "/target", *COMMANDS)
     options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]

@@ -158,7 +158,7 @@ def test_no_run_beyond_the_limits_is_best(ur5, tmp_path, capsys):
     assert said in capsys.readouterr().out
 
 
-def test_what_rounding_tells_apart_is_equal(native_path, tmp_path, capsys):
+def test_runs_that_differ_by_rounding_rank_equally(native_path, tmp_path, capsys):
     """These values of rcond change the runs by rounding at most."""
     grid = ["--grid", "rcond=0.001:0.002:3", "--stop-time", "0.3", "-o", str(tmp_path / "s")]
     assert main(["sweep", str(native_path), *grid]) == 0

@@ -115,7 +115,7 @@ def test_a_robot_is_read_by_its_address(fmus, three, tmp_path, capsys):
     assert np.array_equal(read_bag(again).q, read_bag(f"{bag}:fleet/right").q)
 
 
-def test_which_robot_is_meant_must_be_said(fmus, three, tmp_path, capsys):
+def test_the_robot_of_a_bag_must_be_named(fmus, three, tmp_path, capsys):
     bag = three
     there = f"'{bag}:fleet/right', '{bag}:fleet_right', '{bag}:left'"
     for of, reason in (("", "is of several robots; give one"), (":no", "has no robot 'no'")):
@@ -164,7 +164,7 @@ def test_robots_need_names_that_differ(fmus, tmp_path, names):
         bag.of("1st")
 
 
-def test_no_robot_comes_late(fmus, tmp_path):
+def test_no_robot_joins_a_bag_late(fmus, tmp_path):
     run = runs(fmus)["left"]
     bag = twodof.Bag(tmp_path / "bag")
     early, late = bag.of("early").begin(run), bag.of("late").begin(run)
@@ -271,7 +271,7 @@ def test_a_copy_of_a_robots_provenance_is_no_robot(tmp_path):
     assert robots_of(tmp_path) == ["a/b", "left"]
 
 
-def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(native_path, tmp_path):
+def test_a_robot_without_messages_is_known_by_its_provenance(native_path, tmp_path):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     (tmp_path / "bag/run.json").rename(tmp_path / "bag/run.old.json")
     for read in (read_bag, read_ends):

@@ -139,7 +139,7 @@ def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(ba
 
 
 @pytest.mark.parametrize("whose", ["metadata.yaml", "summary"])
-def test_a_summary_that_metadata_contradicts_is_told_and_mended(bag, whose, capsys, caplog):
+def test_a_summary_that_contradicts_metadata_is_reported_and_repaired(bag, whose, capsys, caplog):
     """Either may be wrong: the file has 12,006 messages."""
     if whose == "summary":
         file = file_of(bag)

@@ -50,7 +50,7 @@ def started():
     return lambda: [child for child in children_of(os.getpid()) if child not in others]
 
 
-def test_nobody_else_can_talk_to_workers(native_path, started):
+def test_workers_have_no_ports_or_names(native_path, started):
     """No socket has a port or a name, no other user can write to their pipes, and each has one thread."""
     before, seen = doors(os.getpid()), {}
 

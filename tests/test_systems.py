@@ -137,7 +137,7 @@ def test_a_connector_may_repeat_the_unit_of_its_variable(plant: bytes, tmp_path:
         np.testing.assert_array_equal(q_of(loop(tmp_path / f"{unit}.ssp", plant, degrees, text), **settings), expected)
 
 
-def test_what_is_probably_not_meant_gets_a_line(
+def test_probable_mistakes_get_a_remark(
     plant: bytes, pd: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A vector is connected in part, or a setting of the plant without a component is also in the other FMU."""

@@ -66,7 +66,7 @@ def test_a_backend_of_matplotlib_that_is_not_here_ends_no_plot(backend, native_p
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_names_are_no_commands_to_the_terminal(native_path, tmp_path):
+def test_names_do_not_control_the_terminal(native_path, tmp_path):
     """This includes suggested commands, warnings of matplotlib, and errors of the command line."""
     name = f"bag {ESCAPES}"
     command = ["run", str(native_path), "--stop-time", "0.1", "-o", name]

@@ -171,7 +171,7 @@ def test_a_target_that_changed_late_is_named() -> None:
 
 
 @pytest.mark.parametrize("robot", list(ROBOTS))
-def test_good_runs_raise_no_alarm(robot: str) -> None:
+def test_good_runs_have_no_cause(robot: str) -> None:
     count = 0
     for run in good_runs(robot):
         kept = Kept()
@@ -362,7 +362,7 @@ def test_a_run_without_a_target_says_so() -> None:
     assert not {"final_error", "final_joint_error", "settling_time", "overshoot"} & {*run.verdict.numbers}
 
 
-def test_gains_of_a_controller_outside_that_the_step_shows() -> None:
+def test_a_step_at_the_stability_limit_of_an_external_controller_is_named() -> None:
     """A PD controller, sampled every 10 ms, is at its stability limit."""
     run = twodof.experiment(fmu_of("arm", "effort"), step=0.01, stop_time=1.0, settings={"gravity": (0.0, 0.0, 0.0)})
     steps, samples = twodof.samples(run), []

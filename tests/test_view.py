@@ -297,7 +297,7 @@ def assert_on_one_arm(system: np.ndarray, middles: np.ndarray) -> None:
     assert min(fitted[2:]) > 0.0 and np.abs(system @ fitted - middles).max() < 1.5  # pixels
 
 
-def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(shown, folder, tmp_path):
+def test_a_third_party_bag_is_drawn_as_far_as_it_is_known(shown, folder, tmp_path):
     bag = tmp_path / "foreign"
     bag.mkdir()
     for file in (folder / "bag").iterdir():
@@ -354,7 +354,7 @@ def painted(folder):
 @pytest.mark.parametrize(
     "options", [["--fmu", "made/painted.fmu"], ["--urdf", "painted.urdf", "--mesh-dir", "packages"]]
 )
-def test_meshes_are_found_where_they_are_said_to_be(shown, folder, painted, run_view, options):
+def test_meshes_are_found_by_their_options(shown, folder, painted, run_view, options):
     done = run_view(painted / "bag", *options, "--export", "painted.html", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
     with opened(shown, (folder / "painted.html").as_uri()) as page:

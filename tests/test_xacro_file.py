@@ -64,7 +64,7 @@ def package(tmp_path: Path) -> Path:
     return folder
 
 
-def test_what_comes_out_is_xacros_own(package: Path) -> None:
+def test_the_result_equals_that_of_xacro(package: Path) -> None:
     """Includes, namespaces, arguments, YAML with units, conditions, blocks, a recursive macro."""
     path = package / "urdf/arm.urdf.xacro"
     free = path.with_name("free.xacro")
