@@ -57,8 +57,7 @@ def check_file(path: str | Path, most: int) -> None:
     if not stat.S_ISREG(state.st_mode):
         raise OSError(errno.EINVAL, "Not a regular file", str(path))
     if state.st_size > most:
-        reason = f"{os.strerror(errno.EFBIG)}, {state.st_size} bytes, at most {most}"
-        raise OSError(errno.EFBIG, reason, str(path))
+        raise OSError(errno.EFBIG, f"{os.strerror(errno.EFBIG)}, {state.st_size} bytes, at most {most}", str(path))
 
 
 def read_file(path: str | Path, most: int, *, follow: bool = True) -> bytes:

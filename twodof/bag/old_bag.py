@@ -76,14 +76,12 @@ def _hold(path: Path, overwrite: bool) -> int | None:
         if not path.exists():
             return None
         if not overwrite:
-            reason = "exists already; choose another with `path` or give `overwrite=True`"
-            raise BagError(f"'{path}' {reason}")
+            raise BagError(f"'{path}' exists already; choose another with `path` or give `overwrite=True`")
         if Path.cwd().is_relative_to(path.resolve()):  # a relative path would end elsewhere
             raise BagError(f"'{path}' has the working directory in it and is not overwritten")
         held = lock(path)
     except BlockingIOError as error:
-        reason = "is being written by another process and is not overwritten"
-        raise BagError(f"'{path}' {reason}") from error
+        raise BagError(f"'{path}' is being written by another process and is not overwritten") from error
     except OSError as error:
         raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
     if not _is_bag(path):

@@ -150,8 +150,8 @@ def _followed(commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value]
     trajectories = [trajectory for _, trajectory in read]
     begun, ended = min(it.start for it in trajectories), max(it.times[-1] for it in trajectories)
     if not ended - begun <= MAX_COMMANDS * step < inf:
-        excess = f"take {ended - begun:g} s, more than {MAX_COMMANDS} steps of {step:g} s"
-        raise InputError(f"{bag}: its trajectories {excess}")
+        most = f"{MAX_COMMANDS} steps of {step:g} s"
+        raise InputError(f"{bag}: its trajectories take {ended - begun:g} s, more than {most}")
     grid = step * np.arange(floor(begun / step) - 1.0, floor(ended / step) + 3.0)
     groups = [fmu.vector(group) for group in FOLLOWING]
     starts = fmu.vector("q_start")

@@ -123,8 +123,7 @@ class Recording:
             schedule: Schedule = [(0, ChainMap({}, starts))]
             changed: dict[str, Value] = {}
             for time, values in changes:
-                steps = (time - self.provenance["start_time"]) / self.provenance["step"]
-                k = max(0, ceil(steps - TIME_TOLERANCE))
+                k = max(0, ceil((time - self.provenance["start_time"]) / self.provenance["step"] - TIME_TOLERANCE))
                 changed = {**changed, **values}
                 if k == schedule[-1][0] and len(schedule) > 1:  # no change precedes the first sample
                     schedule.pop()

@@ -76,8 +76,7 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.execute("PRAGMA writable_schema = ON")  # reads files that lack their end
             database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
-            tables = "SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"
-            schema = dict(database.execute(tables))
+            schema = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"))
             database.set_progress_handler(None, 0)
             if not schema.keys() >= {"topics", "messages"}:
                 raise DamageError(f"'{path.name}' has no messages")

@@ -35,8 +35,7 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
         say("the Python flavour is for Linux x86-64: building the native one", error=True)
     if not of_urdf:
         return _default_arm(options.verb, native=native)
-    overwrite = getattr(options, "overwrite", False)
-    return _built(overwrite, urdf=Path(options.fmu), frame=options.frame, native=native)
+    return _built(getattr(options, "overwrite", False), urdf=Path(options.fmu), frame=options.frame, native=native)
 
 
 def fast_fmu(options: argparse.Namespace) -> Path:

@@ -71,8 +71,7 @@ def _show_bags(path: Path, as_json: bool) -> None:
     bags = [read_ends(robot) for robot in each_robot(path)]
     if as_json:
         facts = [_bag_facts(bag) for bag in bags]
-        several = dict(kind="bag", path=str(path), robots=facts)
-        print_json(**facts[0] if len(facts) == 1 else several)
+        print_json(**facts[0] if len(facts) == 1 else dict(kind="bag", path=str(path), robots=facts))
         return
     for i, bag in enumerate(bags):
         if i > 0:
@@ -87,17 +86,11 @@ def _print_fmu_json(fmu: Fmu) -> None:
         kind="system" if isinstance(fmu, System) else "FMU",
         **(dict(components=[*fmu.components], connections=fmu.connections) if isinstance(fmu, System) else {}),
         path=str(fmu.path),
-        name=fmu.name,
-        guid=fmu.guid,
+        **{key: getattr(fmu, key) for key in ("name", "guid")},
         tool=fmu.description.generationTool,
-        platforms=fmu.platforms,
-        robot=fmu.robot,
-        joints=fmu.joints,
-        frame=fmu.frame,
-        root=fmu.root,
-        axes=fmu.axes,
+        **{key: getattr(fmu, key) for key in ("platforms", "robot", "joints", "frame", "root", "axes")},
         variables=[
-            {"name": v.name, "causality": v.causality, "type": v.type, "unit": v.unit, "start": v.start}
+            {key: getattr(v, key) for key in ("name", "causality", "type", "unit", "start")}
             for v in fmu.variables.values()
         ],
     )

@@ -31,8 +31,7 @@ def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     from ..linear import linearise
 
-    model = linearise(options.fmu, parse_settings(options.at, "--at"))
-    (_print_json if options.json else _print)(model)
+    (_print_json if options.json else _print)(linearise(options.fmu, parse_settings(options.at, "--at")))
     return 0
 
 
@@ -61,5 +60,4 @@ def _print(model: LinearModel) -> None:
         rows = model.states if name in "AB" else model.outputs
         columns = model.states if name in "AC" else model.inputs
         values = ((f"{x:.6g}" for x in row) for row in getattr(model, name).tolist())
-        cells = ([row, *texts] for row, texts in zip(rows, values))
-        print_table(["", *columns], *cells, align=str.rjust)
+        print_table(["", *columns], *([row, *texts] for row, texts in zip(rows, values)), align=str.rjust)

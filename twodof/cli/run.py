@@ -115,13 +115,9 @@ def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime 
         joint_states=last.k + 1,
         end_time=last.t,
         stopped=summary.stopped,
-        q=last.q,
-        v=last.v,
-        x=last.x,
+        **{key: getattr(last, key) for key in ("q", "v", "x")},
         x_des=last.target,
-        error=summary.error,
-        turn_error=summary.turn_error,
-        joint_error=summary.joint_error,
+        **{key: getattr(summary, key) for key in ("error", "turn_error", "joint_error")},
         verdict=summary.verdict.facts(),
         wall_time=summary.wall_time,
         missed=None if pace is None else pace.missed,
@@ -140,16 +136,13 @@ def print_summary(
         if len(elements) > 1 and isinstance(value, int | float):
             rows.append((f"{name}", f"{value:g}, all {len(elements)} elements"))
     if bag is not None:
-        messages = f"{last.k + 1} messages on {bag.topic}, {options.storage}"
-        rows.append(("bag", f"{bag.address} ({messages})"))
+        rows.append(("bag", f"{bag.address} ({last.k + 1} messages on {bag.topic}, {options.storage})"))
     rows += verdict_rows(summary.verdict.lines)
     simulated = last.k * run.step
     speed = simulated / summary.wall_time if summary.wall_time else 0.0
-    taken = f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time"
-    rows.append(("time", taken))
+    rows.append(("time", f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time"))
     if pace is not None:
-        missed = f"{pace.missed} of {last.k + 1} missed, worst {pace.worst * 1e3:.1f} ms"
-        rows.append(("deadlines", missed))
+        rows.append(("deadlines", f"{pace.missed} of {last.k + 1} missed, worst {pace.worst * 1e3:.1f} ms"))
     if summary.stopped:
         complete = "" if bag is None else "; the bag is complete up to there"
         rows.append(("stopped", f"on request at {last.t:g} s{complete}"))

@@ -71,8 +71,7 @@ def standard_headers() -> dict[str, bytes]:
     """Return the headers of FMI 2.0 and 3.0 by file name, from FMPy."""
     fmpy = importlib.util.find_spec("fmpy")
     assert fmpy is not None and fmpy.origin is not None
-    headers = (Path(fmpy.origin).parent / "c-code").glob("fmi[23]*.h")
-    return {header.name: header.read_bytes() for header in headers}
+    return {header.name: header.read_bytes() for header in (Path(fmpy.origin).parent / "c-code").glob("fmi[23]*.h")}
 
 
 def compile_library(

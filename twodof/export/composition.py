@@ -74,8 +74,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     for name in sorted(files):
         digest.update(name.encode() + b"\0" + files[name])
     guid = digest.hexdigest()
-    description = model_description(options, robot, variables, flavour, guid)
-    files["modelDescription.xml"] = description
+    files["modelDescription.xml"] = model_description(options, robot, variables, flavour, guid)
     files[ICONS[flavour.fmi]] = icon(read_urdf(urdf), robot, starts["q_start"])
 
     def finish() -> Files:

@@ -137,8 +137,7 @@ LOWER = np.tril_indices(3)
 
 def _solution(solution: Array, inertial: Array, held: Sequence[str]) -> list[Varied]:
     """Return a = M⁻¹τ and its derivative δa, with M δa = δτ − δM a; ``inertial`` is M a for variables a."""
-    n = len(solution)
-    names = [(f"a[{i}]", f"tau[{i}]") for i in range(n)]
+    names = [(f"a[{i}]", f"tau[{i}]") for i in range(len(solution))]
     value = [a for a, _ in varied(solution, held=held)]
     along = {name: (a, 0.0) for (name, _), a in zip(names, value)}
     rest = {

@@ -46,7 +46,6 @@ def add_units(root: ET.Element, used: Collection[str], fmi: int) -> None:
             if name in DISPLAY:
                 attributes["displayUnit"] = DISPLAY[name][0]
             if fmi == 2:
-                simple = ET.SubElement(definitions, "SimpleType", name=quantity)
-                ET.SubElement(simple, "Real", attributes)
+                ET.SubElement(ET.SubElement(definitions, "SimpleType", name=quantity), "Real", attributes)
             else:
                 ET.SubElement(definitions, "Float64Type", {"name": quantity, **attributes})

@@ -127,8 +127,8 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
             top = root.find(f"{SSD}System")
             assert top is not None  # the schema requires it
             if sum(each.tag in (f"{SSD}Component", f"{SSD}System") for each in top.iterfind(".//*")) > MAX_COMPONENTS:
-                what = f"more than {MAX_COMPONENTS} components and systems"
-                raise FmuError(f"'{path}' has {what}; OMSimulator takes larger systems")
+                most = f"{MAX_COMPONENTS} components and systems"
+                raise FmuError(f"'{path}' has more than {most}; OMSimulator takes larger systems")
             system = file.element(top, "", units)
             if twice := next((name for name, n in Counter(e.name for e in system.walk()).items() if n > 1), None):
                 raise FmuError(

@@ -183,14 +183,12 @@ def instantiate_fmu(fmu: Fmu) -> Iterator[Instance]:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
         there = ", ".join(fmu.platforms) or "none"
         remedy = "" if fmu.platform else "; build one with `native` and `fmi` 3"
-        reason = f"has no binary for this platform ({here}), only for: {there}{remedy}"
-        raise FmuError(f"'{fmu.path}' {reason}")
+        raise FmuError(f"'{fmu.path}' has no binary for this platform ({here}), only for: {there}{remedy}")
     with temporary_folder() as folder:
         with opened(fmu) as archive:
             names = archive.namelist()
             archive.extractall(folder, [name for name in names if not name.startswith(READ)])
-        library = folder / "binaries" / fmu.platform / fmu.library
-        check_python_wrapper(fmu.path, library, folder)
+        check_python_wrapper(fmu.path, folder / "binaries" / fmu.platform / fmu.library, folder)
         instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder)
         try:
             yield instance

@@ -29,8 +29,7 @@ Calls = dict[str, tuple[str, Callable[[Instance], object]]]
 def simulation(trial: Trial) -> str:
     """Do the steps of the default experiment, and read the outputs twice at the end."""
     with trial.instance() as instance:
-        end = trial.rows(instance)[-1:]
-        trial.compare(end, [trial.reader(instance)()], "in a second read at one time")
+        trial.compare(trial.rows(instance)[-1:], [trial.reader(instance)()], "in a second read at one time")
     return f"{STEPS} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
 
 

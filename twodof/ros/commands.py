@@ -143,8 +143,7 @@ class Commands:
     def _of_frame(self, kind: str, message: Any) -> Inputs:
         frame = message.header.frame_id
         if frame not in ("", self._root):
-            elsewhere = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
-            raise CommandError("frame", f"is in frame {elsewhere}")
+            raise CommandError("frame", f"is in frame {frame[:LONGEST_NAME]!r}, not in '{self._root}'")
         point = message.pose.position if kind == POSE else message.point
         given = {name: getattr(point, axis) for name, axis in zip(self._groups["x_des"], self._axes)}
         if kind == POSE:

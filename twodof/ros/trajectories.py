@@ -82,9 +82,8 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
     times = [stamp + _nanoseconds(point.time_from_start) for point in message.points]
     if not times or any(late <= early for early, late in pairwise(times)):
         raise CommandError("times", "has no points, or their times do not increase")
-    if times[-1] < came:
-        late = f"{(came - times[-1]) / NANOSECONDS:.3g} s before it starts"
-        raise CommandError("stamp", f"ends {late}; its stamp must be 0 or of the bag's clock")
+    if (late := (came - times[-1]) / NANOSECONDS) > 0.0:
+        raise CommandError("stamp", f"ends {late:.3g} s before it starts; its stamp must be 0 or of the bag's clock")
     points = []
     for point in message.points:
         count = 3 if len(point.accelerations) else 2 if len(point.velocities) else 1

@@ -46,8 +46,7 @@ def layouts(
     """
     check_name("namespace", namespace)
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
-    effort = bool(fmu.vector("tau"))
-    own = Messages(experiment(fmu, stop_time=1.0, step=1.0), scene=True, effort=effort).topics
+    own = Messages(experiment(fmu, stop_time=1.0, step=1.0), scene=True, effort=bool(fmu.vector("tau"))).topics
     prefix = f"/{namespace.strip('/')}" if namespace else ""
     types = {prefix + name: topic.type for name, topic in own.items()}
     units = {
@@ -64,8 +63,7 @@ def layouts(
     contents = {Path(f"{stem}{ending}"): text.encode() for ending, text in texts.items()}
     for path, content in contents.items():
         if not overwrite and path.exists() and path.read_bytes() != content:
-            reason = "exists and differs; choose another folder or give `overwrite=True`"
-            raise InputError(f"'{path}' {reason}")
+            raise InputError(f"'{path}' exists and differs; choose another folder or give `overwrite=True`")
     with refusing(InputError, f"make the folder '{folder}'"):
         stem.parent.mkdir(parents=True, exist_ok=True)
     for path, content in contents.items():
