@@ -1,6 +1,7 @@
 """Generate ``mechanism.c`` of the native flavour: the robot's kinematics and dynamics as C."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -15,8 +16,6 @@ from .recursions import (
     inverse_dynamics,
     mass_matrix,
     operations_of_factors,
-    solve_by_factors,
-    solve_by_recursion,
     task_frame,
 )
 from .straight_line import Expression, Value, Varied, c_function, operations, varied
@@ -97,18 +96,15 @@ def _forward_dynamics(
     """
     n = robot.G.shape[1]
     a, tau, free, given = (_variables(name, n) for name in ("a", "tau", "free", "given"))
-    split = free * given, free, given - free * given
-    ways, hybrids = [], []
-    if n == len(robot.parent):
-        ways.append(solve_by_recursion(robot, bodies, joint, armature, tau))
-        hybrids.append(hybrid_by_recursion(robot, bodies, joint, armature, *split))
+    all_free, split = (tau, np.ones(n), np.zeros(n)), (free * given, free, given - free * given)
+    solvers = [partial(hybrid_by_recursion, robot, bodies, joint, armature)] if n == len(robot.parent) else []
+    ways = [solve(*all_free)[0] for solve in solvers]
     if not ways or operations_of_factors(robot.parent) < operations(ways[0]):
-        M = mass_matrix(robot, bodies, joint, armature)
-        ways.insert(0, solve_by_factors(M, tau))
-        hybrids.insert(0, hybrid_by_factors(M, *split))
+        solvers.insert(0, partial(hybrid_by_factors, mass_matrix(robot, bodies, joint, armature)))
+        ways.insert(0, solvers[0](*all_free)[0])
     solution = min(ways, key=operations)
     inertial = inverse_dynamics(robot, bodies, joint, armature, np.zeros(n), a, np.zeros(3))
-    hybrid = min(hybrids, key=lambda both: operations([*both[0], *both[1]]))
+    hybrid = min((solve(*split) for solve in solvers), key=lambda both: operations([*both[0], *both[1]]))
     solve = f"void acceleration_of_effort({in_all}, {INERTIAS}, const double tau[N_JOINTS], double a[N_JOINTS])"
     hold = (
         f"void hybrid_dynamics({in_all}, {INERTIAS}, const double free[N_JOINTS],"

@@ -181,17 +181,6 @@ def operations_of_factors(parent: Sequence[int]) -> int:
     return sum(count * (count + 1) for count in ancestors)
 
 
-def solve_by_factors(M: Array, tau: Array) -> Array:
-    """Return M⁻¹τ by the factors of ``hybrid_by_factors``."""
-    return hybrid_by_factors(M, tau, np.ones(len(tau)), np.zeros(len(tau)))[0]
-
-
-def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, armature: Array, tau: Array) -> Array:
-    """Return M⁻¹τ by articulated bodies; no joint may mimic another."""
-    n = len(tau)
-    return hybrid_by_recursion(robot, body, joint, armature, tau, np.ones(n), np.zeros(n))[0]
-
-
 def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[Array, Array]:
     """Return a and λ of M a = τ + λ: free joints have λ = 0, the others have a prescribed a.
 
