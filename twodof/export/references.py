@@ -13,7 +13,7 @@ solvers must agree with it. The format is FMI-LS-REF 1.0.0-beta.1 with MA-HS-Exp
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -74,7 +74,8 @@ def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[st
         times: Array = STEP * np.arange(STEPS + 1, dtype=np.float64)
         files[f"{name}-in.csv"] = _csv(times, stimuli)
         files[f"{name}-ref.csv"] = _csv(times[ROWS], {key: column[ROWS] for key, column in found[0].items()})
-        files[f"{name}.ssv"] = _parameter_set(name, values, names)
+        texts = {n: str(value).lower() if isinstance(value, bool) else f"{value:.9g}" for n, value in values.items()}
+        files[f"{name}.ssv"] = parameter_set(name, ((n, names[n].type, value) for n, value in texts.items()))
         text = f"{', '.join(exact)} in closed form, the rest by" if exact else "by"
         described = f"references: {text} two solvers; deviations are of a variable's largest magnitude, or of 1"
         experiment = ET.SubElement(experiments, "Experiment", name=name, description=described)
@@ -209,13 +210,12 @@ def _csv(times: Array, columns: Columns) -> bytes:
     return "".join(f"{','.join(row)}\n" for row in [["time", *columns], *rows]).encode()
 
 
-def _parameter_set(name: str, values: Mapping[str, float | bool], names: Mapping[str, Variable]) -> bytes:
+def parameter_set(name: str, rows: Iterable[tuple[str, str, str]]) -> bytes:
+    """Return the text of a parameter set of SSP 1.0, by name, type and value of each parameter."""
     root = ET.Element("ssv:ParameterSet", {"xmlns:ssv": SSV, "version": "1.0", "name": name})
     parameters = ET.SubElement(root, "ssv:Parameters")
-    for key, value in values.items():
-        parameter = ET.SubElement(parameters, "ssv:Parameter", name=key)
-        text = str(value).lower() if isinstance(value, bool) else f"{value:.9g}"
-        ET.SubElement(parameter, f"ssv:{names[key].type}", value=text)
+    for own, kind, value in rows:
+        ET.SubElement(ET.SubElement(parameters, "ssv:Parameter", name=own), f"ssv:{kind}", value=value)
     return xml_text(root)
 
 

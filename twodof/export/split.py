@@ -16,9 +16,10 @@ from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
 from .model_description import FMI3_TYPES
 from .model_structure import SENSORS
+from .references import parameter_set
 
 SSP = "http://ssp-standard.org/SSP1/SystemStructure"
-SSC, SSD, SSV = (f"{{{SSP}{name}}}" for name in ("Common", "Description", "ParameterValues"))
+SSC, SSD = f"{{{SSP}Common}}", f"{{{SSP}Description}}"
 WIRES = (
     ("plant", "q", "controller", "q"),
     ("plant", "v", "controller", "v"),
@@ -110,21 +111,12 @@ def _structure(title: str, tables: Mapping[str, Mapping[str, Row]]) -> bytes:
         ends = dict(startElement=start, startConnector=own, endElement=end, endConnector=other)
         ET.SubElement(connections, f"{SSD}Connection", ends)
     ET.SubElement(root, f"{SSD}DefaultExperiment", startTime="0.0", stopTime="5.0")
-    return _text(root)
+    ET.register_namespace("ssc", SSC[1:-1])
+    ET.register_namespace("ssd", SSD[1:-1])
+    return xml_text(root)
 
 
 def _values(name: str, table: Mapping[str, Row]) -> bytes:
     """Return the parameter set of a component: the start values of its parameters and inputs."""
-    root = ET.Element(f"{SSV}ParameterSet", version="1.0", name=name)
-    parameters = ET.SubElement(root, f"{SSV}Parameters")
-    for own, variable in table.items():
-        if variable.causality in ("parameter", "input") and variable.start is not None:
-            parameter = ET.SubElement(parameters, f"{SSV}Parameter", name=own)
-            ET.SubElement(parameter, f"{SSV}{variable.type}", value=variable.start)
-    return _text(root)
-
-
-def _text(root: ET.Element) -> bytes:
-    for prefix, name in (("ssc", SSC), ("ssd", SSD), ("ssv", SSV)):
-        ET.register_namespace(prefix, name[1:-1])
-    return xml_text(root)
+    own = {key: v for key, v in table.items() if v.causality in ("parameter", "input")}
+    return parameter_set(name, ((key, v.type, v.start) for key, v in own.items() if v.start is not None))
