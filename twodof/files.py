@@ -97,7 +97,8 @@ def check_archive(path: str | Path | bytes) -> None:
     """
     if not isinstance(path, bytes):
         check_file(path, MAX_ARCHIVE)
-    with _Content(path) if isinstance(path, bytes) else _Archive(path) as file, zipfile.ZipFile(file) as archive:
+    raw = io.BytesIO(path) if isinstance(path, bytes) else io.FileIO(path)
+    with _Directory(raw) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
     files = set[str]()
     for member in members:
@@ -141,24 +142,13 @@ def read_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
         return file.read(member.file_size)
 
 
-class _Archive(io.FileIO):
-    """A zip archive that limits reads by the sizes in its list of members."""
+class _Directory(io.BufferedReader):
+    """A zip archive whose list of members is read, of limited size."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        return super().read(_within_directory(size))
-
-
-class _Content(io.BytesIO):
-    """The content of such an archive."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        return super().read(_within_directory(size))
-
-
-def _within_directory(size: int | None) -> int | None:
-    if size is not None and size > MAX_DIRECTORY:
-        raise OSError(errno.EFBIG, "Too many members")
-    return size
+        if size is not None and size > MAX_DIRECTORY:
+            raise OSError(errno.EFBIG, "Too many members")
+        return super().read(size)
 
 
 def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
