@@ -209,8 +209,7 @@ def _names(path: str | Path) -> Iterator[Path]:
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Make a folder that is removed at the end, or by the next process if this one is killed.
 
-    Args:
-        parent: folder in which it is made; None: the system's folder for temporary files.
+    Without a parent folder it is in the system's folder for temporary files.
 
     Raises:
         OSError: it cannot be made.
@@ -247,9 +246,7 @@ def _remove_abandoned(folder: Path) -> None:
 def lock(path: Path, *, wait: bool = False) -> int:
     """Lock a folder against other writers until the returned descriptor is closed or the process ends.
 
-    Args:
-        path: the folder.
-        wait: wait up to LOCK_TIMEOUT s for processes that only check the lock.
+    With ``wait``, wait up to LOCK_TIMEOUT s for processes that only check the lock.
 
     Raises:
         BlockingIOError: another process writes it.

@@ -44,10 +44,6 @@ def stated_count(folder: Path) -> int | None:
 def read_messages(file: Path, budget: ReadBudget) -> Iterator[Batch]:
     """Read all messages of a file; the messages of a channel are in order.
 
-    Args:
-        file: a storage file of a bag.
-        budget: read budget of the bag.
-
     Raises:
         DamageError: the file is truncated or damaged.
         OSError: the file cannot be read.

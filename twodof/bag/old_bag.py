@@ -17,10 +17,6 @@ class OldBag:
 
     A process that is killed at any time leaves the old bag, or the new one as far as it was written.
 
-    Args:
-        path: folder of both.
-        overwrite: whether there may be an old bag.
-
     Raises:
         BagError: the folder is not a bag, is being written, or exists and may not be overwritten.
     """

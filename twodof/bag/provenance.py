@@ -81,12 +81,6 @@ class ProvenanceFile:
 
     Only the commanders and the verdict follow the changes of inputs, so that adding a change rewrites few bytes.
 
-    Args:
-        folder: folder of the bag.
-        namespace: namespace of the robot in it, or "".
-        run: the experiment.
-        command_line: command line that made the bag, or "".
-
     Raises:
         OSError: the file cannot be written. ``add`` raises it too, and can be called again.
     """
@@ -162,7 +156,6 @@ def provenance_of(run: Experiment, command_line: str) -> Provenance:
 
 
 def _system(system: System) -> Provenance:
-    """Return the FMUs of a system and their connections."""
     fmus = {name: {"name": fmu.name, "guid": fmu.guid} for name, fmu in system.components.items()}
     return {"system": {"components": fmus, "connections": system.connections}}
 

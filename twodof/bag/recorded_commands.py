@@ -117,7 +117,6 @@ def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
 
 
 def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Sequence[str]) -> str:
-    """Return the only topic that can hold commands."""
     if len(topics) == 1:
         return next(iter(topics))
     there = ", ".join(sorted(map(shown, topics)))

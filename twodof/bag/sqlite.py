@@ -92,7 +92,6 @@ def _unfinished(path: Path) -> list[Path]:
 
 
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
-    """Return topics by their id."""
     definitions = {row[1]: row[3] for row in _rows(path, database, "message_definitions")}
     channels = {}
     for number, topic, kind, serialization, qos, digest in _rows(path, database, "topics"):

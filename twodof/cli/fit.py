@@ -83,7 +83,6 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _design(options: argparse.Namespace) -> int:
-    """Write a motion to record; return the exit status."""
     from ..identification.excitation import FINE, excite
     from ..simulation.progress import counting
 

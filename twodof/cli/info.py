@@ -64,7 +64,6 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _show_bags(path: Path, as_json: bool) -> None:
-    """Show each robot of the bag."""
     from ..bag.provenance import each_robot
     from ..bag.reader import read_ends
 

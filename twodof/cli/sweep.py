@@ -178,7 +178,6 @@ def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
 
 
 def _ranges(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Return the ranges of --range."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in texts:
         name, (low, high) = _parse("--range", text, "NAME=LOW:HIGH", ranges)

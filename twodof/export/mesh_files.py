@@ -23,7 +23,6 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     folder and its package are refused, also if a link leads there. Missing meshes are left out with a warning.
 
     Args:
-        urdf: XML text.
         folder: the URDF's own folder, in which relative names and packages are searched.
         mesh_dir: folder of the packages, of one package, or of the meshes themselves.
     """

@@ -105,7 +105,6 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
 
 
 def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
-    """Yield the rows of an FMU."""
     problems = problems_of(path, inside)
     problems[MOST_PROBLEMS:] = [f"and {len(problems) - MOST_PROBLEMS} more"] * (len(problems) > MOST_PROBLEMS)
     try:

@@ -50,9 +50,6 @@ class Slopes(NamedTuple):
 class Point:
     """The values of inputs and states at which derivatives are compared.
 
-    Args:
-        trial: the FMU.
-
     Attributes:
         values: the point, by the names of the knowns.
         unknowns: names of outputs and derivatives.

@@ -207,7 +207,6 @@ class _File:
         return member
 
     def _bound(self, binding: ET.Element, name: str) -> Iterator[Parameter]:
-        """Yield the parameters of a binding."""
         root = self._content(binding, f"{SSD}ParameterValues", SSV, "ParameterValues", name)
         units, prefix = _units(root.find(f"{SSV}Units")), binding.get("prefix", "")
         given: dict[str, Parameter] = {}
@@ -256,7 +255,6 @@ def _schema(kind: str) -> lxml.etree.XMLSchema:
 
 
 def _units(xml: ET.Element | None) -> dict[str, Unit]:
-    """Return the units of a file by name."""
     units = {}
     for unit in [] if xml is None else xml.iterfind(f"{SSC}Unit"):
         base, name = unit.find(f"{SSC}BaseUnit"), unit.get("name", "")

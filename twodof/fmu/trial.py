@@ -30,7 +30,6 @@ class Trial:
     """An FMU with its default experiment.
 
     Args:
-        fmu: the FMU.
         note: called with the name of the next call, which the report of a crash contains.
 
     Attributes:

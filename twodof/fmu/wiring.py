@@ -38,13 +38,7 @@ class Link(NamedTuple):
 
 
 class Wiring:
-    """Elements of a system by full name, their variables and units, and their connections.
-
-    Args:
-        path: path for messages.
-        top: the top system.
-        fmus: FMUs of the components, by full name.
-    """
+    """Elements of a system by full name, their variables and units, and their connections."""
 
     def __init__(self, path: object, top: Element, fmus: Mapping[str, Fmu]) -> None:
         self._path, self._fmus = path, fmus

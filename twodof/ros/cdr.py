@@ -43,8 +43,7 @@ class MixtureError(Exception):
 class Layout:
     """Layout of serialised messages that differ only in stamps and numbers, like the messages of a run.
 
-    Args:
-        parts: the parts in their order: a stamp, a text, the length of a sequence, or numbers.
+    Its parts, in their order, are stamps, texts, lengths of sequences, and numbers.
     """
 
     def __init__(self, *parts: Stamp | str | int | Numbers) -> None:

@@ -35,11 +35,7 @@ def warner(log: logging.Logger) -> Callable[[str, str], None]:
 
 
 class CommandError(Exception):
-    """A message is not a valid command.
-
-    Attributes:
-        kind: kind of the fault, one word.
-    """
+    """A message is not a valid command; ``kind`` is the fault in one word."""
 
     def __init__(self, kind: str, text: str) -> None:
         super().__init__(text)
@@ -102,9 +98,6 @@ def sized(part: Sequence[float], what: str, names: Sequence[str]) -> Sequence[fl
 
 class Commands:
     """The message types that an FMU can follow.
-
-    Args:
-        fmu: the commanded FMU.
 
     Attributes:
         type: message type that commands all inputs of the control law; "" if the FMU accepts no commands.
@@ -174,7 +167,6 @@ class Watchdog:
     Targets are held with velocity 0; efforts are ramped to 0.
 
     Args:
-        fmu: the commanded FMU.
         timeout: time without a command, s.
         ramp: whether to ramp efforts to 0; None: ramp if the FMU has commanded efforts.
 

@@ -33,12 +33,7 @@ PROPERTIES = {
 
 
 class Commanders:
-    """Recorder of the nodes that command the robot, with a warning of conflicts.
-
-    Args:
-        participant: participant of the DDS domain.
-        run: the commanded experiment, in which nodes are recorded.
-    """
+    """Recorder of the nodes that command the robot, in its experiment, with a warning of conflicts."""
 
     def __init__(self, participant: domain.DomainParticipant, run: Experiment) -> None:
         # readers that keep what they have received, because a node may leave before its command is read
@@ -81,12 +76,10 @@ class Listener:
     """Readers of commands, and of requests to pause and to step.
 
     Args:
-        participant: participant of the DDS domain.
         follows: mapping from messages to the FMU's inputs.
         received: topics and types of commands.
         orders: receive /pause and /step.
         oldest: largest age of a joint command's stamp relative to the sample, s; None: any age.
-        run: the commanded experiment.
     """
 
     def __init__(
@@ -139,12 +132,7 @@ class Listener:
                 yield command
 
     def await_go(self, stop: Callable[[], bool], pace: RealTime | None) -> None:
-        """Wait while the run is paused, except for requested steps.
-
-        Args:
-            stop: called while it waits; True ends the wait.
-            pace: restarted after a pause.
-        """
+        """Wait while the run is paused, except for requested steps, until ``stop`` returns True; restart the pace."""
         if not self._orders:
             return
         self._take_orders()

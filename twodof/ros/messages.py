@@ -130,7 +130,6 @@ class Messages:
     """The messages of a run, serialised.
 
     Args:
-        run: the experiment of the samples.
         scene: also robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         clock: also the samples' stamps on /clock.

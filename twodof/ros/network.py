@@ -149,9 +149,7 @@ def network_of_environment(variables: Mapping[str, str] = os.environ, *, subnet:
 
     The default range is LOCALHOST, not SUBNET as in ROS 2: nothing leaves the host without permission.
 
-    Args:
-        variables: the environment.
-        subnet: use the range SUBNET, and ignore the variables of the range.
+    With ``subnet``, the range is SUBNET, whatever the variables of the range are.
 
     Raises:
         PublishError: a variable is invalid; the message names it.
@@ -198,10 +196,7 @@ def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
 class OpenDomain(NamedTuple):
     """A DDS domain that closes with its last reference; several publishers may share it.
 
-    Attributes:
-        network: the network.
-        interface: names of the network interfaces in use.
-        handle: Cyclone DDS's handle of the domain.
+    ``interface`` has the names of the network interfaces in use.
     """
 
     network: Network

@@ -67,7 +67,6 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
     stamp is 0.
 
     Args:
-        cdr: the message.
         joints: indices of the robot's joints by name.
         came: recording time, ns since the epoch.
         begin: time 0 of the run, ns since the epoch.
@@ -97,16 +96,13 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
 
 
 def _nanoseconds(time: Any) -> int:
-    """Return a Time or Duration in ns."""
     return int(time.sec * NANOSECONDS + time.nanosec)
 
 
 class _Path:
     """Desired motion of a joint over time: polynomials, each until the next begins.
 
-    Args:
-        begin: start time, s.
-        q: rest position before the first polynomial, rad or m.
+    Before them it rests at ``q``, rad or m; ``begin`` is in s.
     """
 
     def __init__(self, begin: float, q: float) -> None:
