@@ -171,55 +171,54 @@ class Instance:
         """Return the number of values as an argument, if this version of FMI has this argument."""
         return ()
 
-    def _on_vectors(
-        self, function: Callable[..., int], names: Sequence[str], values: Values
-    ) -> tuple[Callable[[], Values], Values, list[int], list[int]]:
-        """Return a call of the library on whole vectors, its buffer, the variables' indices there, and the references.
-
-        The buffer is ``values`` if these are whole vectors.
-        """
+    def reader(self, names: Sequence[str], into: Values | None = None) -> Callable[[], Values]:
+        """Return a function that reads Real variables, always into the same buffer, which may be given."""
         distinct, columns, size = self._columns(names)
+        values = (c_double * len(columns))() if into is None else into
         whole = values if columns == [*range(size)] else (c_double * size)()
         references = (c_uint * len(distinct))(*distinct)
-        vectors = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
-        arguments = self._component, *vectors
+        asked = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
+        get, arguments = self._get, (self._component, *asked)
 
-        def call() -> Values:
+        def read() -> Values:
             self._said = ""
-            if (status := function(*arguments)) > WARNING:
+            if (status := get(*arguments)) > WARNING:
                 self._refuse(status)
             return whole
 
-        return call, whole, columns, distinct
-
-    def reader(self, names: Sequence[str], into: Values | None = None) -> Callable[[], Values]:
-        """Return a function that reads Real variables, always into the same buffer, which may be given."""
-        values = (c_double * len(names))() if into is None else into
-        get, whole, columns, _ = self._on_vectors(self._get, names, values)
         if whole is values:
-            return get
+            return read
 
         def read_elements() -> Values:
-            get()
+            read()
             values[:] = [whole[column] for column in columns]
             return values
 
         return read_elements
 
-    def writer(self, names: Sequence[str], values: Values) -> Callable[[], object]:
+    def writer(self, names: Sequence[str], values: Values) -> Callable[[], None]:
         """Return a function that sets Real variables to the values in a buffer.
 
         Other elements of their vectors keep their last values.
         """
-        put, whole, columns, distinct = self._on_vectors(self._put, names, values)
+        distinct, columns, size = self._columns(names)
+        whole = values if columns == [*range(size)] else (c_double * size)()
+        references = (c_uint * len(distinct))(*distinct)
+        given = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
+        put, arguments = self._put, (self._component, *given)
+
+        def write() -> None:
+            self._said = ""
+            if (status := put(*arguments)) > WARNING:
+                self._refuse(status)
 
         def write_elements() -> None:
             whole[:] = [*chain(*(self._vectors["Real", reference] for reference in distinct))]
             for column, value in zip(columns, values):
                 whole[column] = value
-            put()
+            write()
 
-        return put if whole is values else write_elements
+        return write if whole is values else write_elements
 
     def value(self, name: str) -> float | bool:
         """Return the value of an Integer or Boolean variable."""

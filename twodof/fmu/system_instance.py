@@ -143,7 +143,7 @@ class SystemInstance:
                 move = self._set_one if node in incoming else self._read_one
                 yield element, partial(move, instance, node, incoming[node].source if node in incoming else node)
 
-    def _writer(self, instance: Instance, sinks: Sequence[Link]) -> Callable[[], object]:
+    def _writer(self, instance: Instance, sinks: Sequence[Link]) -> Callable[[], None]:
         """Return a function that sets inputs from signals; equal signals in order are not copied."""
         names, columns = [link.target.connector for link in sinks], [self._columns[link.source] for link in sinks]
         equal = all(link.map == IDENTITY for link in sinks)
