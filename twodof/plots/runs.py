@@ -93,7 +93,9 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     texts = [common_settings(tracks)]
     texts += [TARGET] * any(joint.target.size for track in tracks for joint in track.joints)
     texts += [HELD] * any(stroke.label == HELD for panel in panels for stroke in panel.strokes)
-    texts += [f"▼ {', '.join(named)}"] if (named := _marked([*panels, *([error] if error else [])])) else []
+    strokes = [stroke for panel in (*panels, *([error] if error else [])) for stroke in panel.strokes]
+    marks = dict.fromkeys(stroke.label for stroke in strokes if stroke.mark == "v")
+    texts += [f"▼ {', '.join(marks)}"] if marks else []
     texts += outcome(tracks[0]) if len(tracks) == 1 else []
     size = width + BESIDE * bool(pictures), height
     handles = [Line2D([], [], label=line.label, **_line(line.colour, line.dashes)) for line in bags * (len(bags) > 1)]
@@ -121,11 +123,6 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
         axes = room.add_subplot(grid[rows, :])
         _draw_error(axes, error)
         _time_axis(axes, last)
-
-
-def _marked(panels: Iterable[Panel]) -> list[str]:
-    """Return the names of the marks in panels."""
-    return [*dict.fromkeys(stroke.label for panel in panels for stroke in panel.strokes if stroke.mark == "v")]
 
 
 def _units(panels: Sequence[Panel]) -> list[list[str]]:
