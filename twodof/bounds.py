@@ -31,6 +31,12 @@ MAX_XACRO_MEMORY = 1024 * MIB  # address space
 MAX_XACRO_SECONDS = 8
 MAX_XACRO_WAIT = 60  # s by the clock
 
+# sources in an FMU, compiled for a page
+MAX_COMPILER_MEMORY = 4096 * MIB  # address space of one process; tiago_dual takes 0.3 GiB of memory
+MAX_COMPILER_SECONDS = 300  # of one process; tiago_dual takes 9
+MAX_COMPILER_WAIT = 600  # s of wall time
+MAX_COMPILER_TEXT = 1 * MIB  # its messages
+
 # meshes of one robot
 MAX_MESHES = 256 * MIB  # all files together
 MAX_TRIANGLES = 2_000_000  # in one picture; a Panda has 135,000

@@ -18,7 +18,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from select import poll
-from signal import strsignal
+from signal import SIGKILL, strsignal
 from subprocess import DEVNULL, Popen
 from threading import Thread, Timer
 from typing import Any
@@ -43,7 +43,7 @@ NO_NEW_PRIVILEGES = 38  # option of prctl
 LANDLOCK_CREATE, LANDLOCK_ADD, LANDLOCK_RESTRICT = 444, 445, 446  # on all architectures
 FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 """Number of rights to files that a version of Landlock handles."""
-READ = 1 << 2 | 1 << 3  # files and folders
+READ, EXECUTE = 1 << 2 | 1 << 3, 1 << 0  # files and folders; programs
 SECCOMP, FILTER, ALL_THREADS = 317, 1, 1
 X86_64 = 0xC000003E
 READ_ONLY = ~(os.O_CLOEXEC | os.O_NONBLOCK | os.O_DIRECTORY | os.O_NOFOLLOW | 0o100000)
@@ -127,7 +127,7 @@ class Child(Connection):
         Raises:
             EOFError: the process has ended; the text says how.
         """
-        timer = Timer(seconds, self._process.kill)
+        timer = Timer(seconds, self._kill)
         timer.daemon = True
         timer.start()
         try:
@@ -146,8 +146,13 @@ class Child(Connection):
     def close(self) -> None:
         """End the process at once."""
         super().close()
-        self._process.kill()
+        self._kill()
         self._process.wait()
+
+    def _kill(self) -> None:
+        """End the process with the programs that it has started, which are in its session."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, SIGKILL)
 
 
 def _path() -> list[str]:
@@ -168,8 +173,14 @@ def _call(function: Callable[..., None], arguments: tuple[object, ...], pipe: Co
     os.set_inheritable(pipe.fileno(), False)  # programs that an FMU starts must not keep the pipe open
     closed = poll()
     closed.register(pipe, 0)
-    Thread(target=lambda: closed.poll() and os._exit(1), daemon=True).start()
+    Thread(target=_end_with, args=(closed,), daemon=True).start()
     function(pipe, *arguments)
+
+
+def _end_with(closed: poll) -> None:
+    """End this process, and the programs that it has started, once its pipe has closed."""
+    closed.poll()
+    os.killpg(0, SIGKILL)
 
 
 def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
@@ -181,12 +192,22 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
         folders: the only folders whose files it may read, on kernels with Landlock.
     """
     limit(memory, {resource.RLIMIT_CPU: seconds, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_NOFILE: DESCRIPTORS})
-    if sys.platform == "linux":
-        libc = ctypes.CDLL(None)
-        if libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0) == 0:
-            _allow_files(libc, folders)
-            if platform.machine() == "x86_64":
-                _allow_calls(libc)
+    libc = _allow_files(dict.fromkeys(folders, READ))
+    if libc is not None and platform.machine() == "x86_64":
+        _allow_calls(libc)
+
+
+def confine_program(memory: int, seconds: int, program: Path, folders: Sequence[Path]) -> None:
+    """Confine this process, which then starts a program, and the program irrevocably.
+
+    Args:
+        memory: largest address space of each process, bytes.
+        seconds: processor time of each process since its start.
+        program: folder of the program and its files, which it may read and execute on kernels with Landlock.
+        folders: the only other folders in which it may read and write there.
+    """
+    limit(memory, {resource.RLIMIT_CPU: seconds})
+    _allow_files({program: READ | EXECUTE, **dict.fromkeys(folders, ~EXECUTE)})
 
 
 def limit(memory: int, others: Mapping[int, int] | None = None) -> None:
@@ -205,20 +226,24 @@ def limit_time(seconds: float) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (min(soft, most), most))
 
 
-def _allow_files(libc: ctypes.CDLL, folders: Sequence[Path]) -> None:
-    """Restrict file access with Landlock to reading below the folders."""
+def _allow_files(folders: Mapping[Path, int]) -> ctypes.CDLL | None:
+    """Restrict file access with Landlock to rights below each folder; return Linux's C library if it can restrict."""
+    libc = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if libc is None or libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0) != 0:
+        return None
     version = libc.syscall(LANDLOCK_CREATE, None, 0, 1)
     if version < 1:
-        return
-    handled = struct.pack("Q", (1 << FILE_RIGHTS[min(version, max(FILE_RIGHTS))]) - 1)
-    rules = libc.syscall(LANDLOCK_CREATE, handled, len(handled), 0)
-    for folder in folders:
+        return libc
+    handled = (1 << FILE_RIGHTS[min(version, max(FILE_RIGHTS))]) - 1
+    rules = libc.syscall(LANDLOCK_CREATE, struct.pack("Q", handled), 8, 0)
+    for folder, rights in folders.items():
         with suppress(OSError):  # a folder that does not exist needs no rule
             descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY)
-            libc.syscall(LANDLOCK_ADD, rules, 1, struct.pack("=Qi", READ, descriptor), 0)
+            libc.syscall(LANDLOCK_ADD, rules, 1, struct.pack("=Qi", rights & handled, descriptor), 0)
             os.close(descriptor)
     libc.syscall(LANDLOCK_RESTRICT, rules, 0)
     os.close(rules)
+    return libc
 
 
 def _allow_calls(libc: ctypes.CDLL) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.util
+import json
 import logging
 import os
 import platform as host
@@ -11,16 +12,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import version
+from multiprocessing.connection import Connection
 from pathlib import Path
 
+from ..bounds import MAX_COMPILER_MEMORY, MAX_COMPILER_SECONDS, MAX_COMPILER_TEXT, MAX_COMPILER_WAIT
+from ..children import Child, confine_program
 from ..errors import BuildError
 from ..files import data_file, temporary_folder, write_file
 from ..notebook import busy
 
 LOG = logging.getLogger(__name__)
+Run = Callable[[Sequence[str], Path, Mapping[str, str]], None]
+"""Run a command in a folder, with environment variables."""
 TARGETS: dict[str, tuple[str, ...]] = {
     "linux64": ("x86_64-linux-gnu.2.17",),
     "win64": ("x86_64-windows-gnu",),
@@ -107,7 +113,7 @@ def compile_library(
 def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str]) -> bytes:
     """Compile C files to a WebAssembly module without imports; attributes in the files name its exports.
 
-    Its function ``_initialize`` must be called first.
+    The module's function ``_initialize`` must be called first. The files may be untrusted: the compiler is confined.
 
     Raises:
         BuildError: there is no compiler for WebAssembly, or the compiler failed.
@@ -116,7 +122,7 @@ def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str]) -> by
         raise BuildError("cannot compile for the browser: install the package 'ziglang' (the extra 'native')")
     LOG.info("compiling for the browser")
     command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *units]
-    return _compile(sources, command, "module.wasm")
+    return _compile(sources, command, "module.wasm", _run_confined)
 
 
 def compiles_for_the_web() -> bool:
@@ -189,8 +195,8 @@ def _link_flags(output: str) -> list[str]:
     return [*flags, *(f"-lapi-ms-win-crt-{part}-l1-1-0" for part in WINDOWS_RUNTIME)]
 
 
-def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) -> bytes:
-    """Compile C files by a command; cache the output of zig."""
+def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str, run: Run | None = None) -> bytes:
+    """Compile C files by a command, which ``run`` runs; cache the output of zig."""
     with temporary_folder() as folder:
         environment, kept = dict(os.environ), None
         if command[: len(ZIG)] == [*ZIG]:
@@ -205,7 +211,7 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
                     return content
         for file, content in sources.items():
             write_file(folder / file, content)
-        _run([*command, "-o", str(folder / output)], folder, environment)
+        (run or _run)([*command, "-o", str(folder / output)], folder, environment)
         content = (folder / output).read_bytes()
         if kept:
             _keep(kept, content)
@@ -243,11 +249,33 @@ def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -
         )
     except OSError as error:
         raise BuildError(f"cannot run the compiler '{command[0]}': {error}") from error
-    if done.returncode != 0:
-        raise BuildError(
-            f"the compiler failed (exit status {done.returncode}): {' '.join(command)}\n"
-            f"{done.stderr.strip() or done.stdout.strip()}"
-        )
+    _check_status(command, done.returncode, done.stderr.strip() or done.stdout.strip())
+
+
+def _check_status(command: Sequence[str], status: int, text: str) -> None:
+    if status != 0:
+        raise BuildError(f"the compiler failed (exit status {status}): {' '.join(command)}\n{text}")
+
+
+def _run_confined(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
+    """Run zig in a process that reads only zig and the sources, and writes only its output and its caches."""
+    ziglang = importlib.util.find_spec("ziglang")
+    assert ziglang is not None and ziglang.origin is not None
+    home = Path(ziglang.origin).parent
+    command = [str(home / ("zig.exe" if sys.platform == "win32" else "zig")), *command[ZIG.index("cc") :]]
+    folders = [folder, Path(environment["ZIG_GLOBAL_CACHE_DIR"])]
+    with Child(_compile_in_child, command, home, folders, environment=environment) as child:
+        try:
+            status, text = json.loads(child.receive(MAX_COMPILER_TEXT, MAX_COMPILER_WAIT))
+        except EOFError as error:
+            raise BuildError(f"the compiler was ended: {error}") from error
+    _check_status(command, status, text)
+
+
+def _compile_in_child(pipe: Connection, command: Sequence[str], home: Path, folders: Sequence[Path]) -> None:
+    confine_program(MAX_COMPILER_MEMORY, MAX_COMPILER_SECONDS, home, folders)
+    done = subprocess.run(command, cwd=folders[0], capture_output=True, text=True, errors="replace", check=False)
+    pipe.send_bytes(json.dumps([done.returncode, done.stderr.strip()[-MAX_COMPILER_TEXT // 8 :]]).encode())
 
 
 def zig_cache() -> Path | None:
