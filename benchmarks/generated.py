@@ -16,7 +16,7 @@ import numpy as np
 from arms import Arm, by_own_compiler, native_cost
 
 from twodof.export.bodies import Array, joint_tree
-from twodof.export.recursions import mass_matrix, solve_by_factors, solve_by_recursion, task_frame
+from twodof.export.recursions import hybrid_by_factors, hybrid_by_recursion, mass_matrix, task_frame
 from twodof.plant.robot import Robot
 
 INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn", "tau_ext")
@@ -28,16 +28,19 @@ GLUE = """
 #undef acceleration
 %s
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                          double a[N_JOINTS])
+                          const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
 {
     const double *value = plant->value;
+    (void)slip, (void)rank; /* the compared robots have neither friction nor a rank that changes */
+    if (margin)
+        *margin = HUGE_VAL;
     const double *given[] = {q, v, %s};
     generated(given, &a, 0, 0, 0);
     return N_AXES;
 }
 """
 RENAMED = b"#define acceleration acceleration_of_the_engine\n"
-NO_DERIVATIVES = b"void differentiate(void);\nvoid differentiate(void) {}\n"
+NO_DERIVATIVES = b"void twodof_differentiate(void);\nvoid twodof_differentiate(void) {}\n"
 
 
 class Symbol:
@@ -63,6 +66,10 @@ def _operation(name: str, swapped: bool) -> Callable[[Symbol, Any], Any]:
 for _name in ("add", "sub", "mul", "truediv"):
     setattr(Symbol, f"__{_name}__", _operation(_name, False))
     setattr(Symbol, f"__r{_name}__", _operation(_name, True))
+
+
+def _all_free(n: int) -> tuple[Array, Array]:
+    return np.ones(n), np.zeros(n)
 
 
 def _vector(name: str, count: int) -> tuple[Any, Array]:
@@ -93,14 +100,14 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
     J, xd = J[rows], J[rows].dot(of["v"])
     wanted = of["xdd_des"] + of["Kd"] * (of["xd_des"] - xd) + of["Kp"] * (of["x_des"] - x[rows])
     wanted = wanted - drift[rows] + of["Kn"][0] * xd
-    a = J.T.dot(solve_by_factors(J.dot(J.T), wanted)) - of["v"] * of["Kn"][0]
+    a = J.T.dot(hybrid_by_factors(J.dot(J.T), wanted, *_all_free(len(wanted)))[0]) - of["v"] * of["Kn"][0]
     if way is not None:
         still = np.zeros(len(robot.joints))
         effort = of["tau_ext"] - of["v"] * np.array(robot.damping)
         a = a + (
-            solve_by_factors(mass_matrix(constants, constants.body, joint, still), effort)
+            hybrid_by_factors(mass_matrix(constants, constants.body, joint, still), effort, *_all_free(n))[0]
             if way == "factors"
-            else solve_by_recursion(constants, constants.body, joint, still, effort)
+            else hybrid_by_recursion(constants, constants.body, joint, still, effort, *_all_free(n))[0]
         )
     result = casadi.vertcat(*(getattr(each, "sx", each) for each in a))
     given = [sx for sx, _ in vectors.values()]

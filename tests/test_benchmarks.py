@@ -107,6 +107,8 @@ def test_the_rival_has_the_same_right_hand_side(benchmarks):
 def test_the_engine_is_timed_in_c(benchmarks, tmp_path):
     arm = benchmarks.arms.shipped_arm()
     costs = [benchmarks.arms.native_cost(arm, tmp_path)()]
+    rival = benchmarks.generated.with_rival(arm, None)
+    costs += [benchmarks.arms.native_cost(arm, tmp_path, rival)()]
     costs += benchmarks.engine.derivative_costs(benchmarks.arms.shipped_arm("pose"), tmp_path, 100)
     assert all(0.0 < cost < 1e-3 for cost in costs)
 

@@ -18,7 +18,6 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from ..errors import BuildError
 from ..plant.plant import Plant
@@ -133,6 +132,8 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns
 
 def _solve(plant: Plant, names: Mapping[str, Variable], stimuli: Columns, method: str, tolerance: float) -> Columns:
     """Return the outputs at each communication point by one solver, with inputs held over each step."""
+    from scipy.integrate import solve_ivp  # which takes 0.4 s to import, and most builds have no references
+
     n, rank = len(plant.q), -1
     plant.q, plant.v = list(plant.q_start), list(plant.v_start)
     outputs = [v for v in names.values() if v.causality == "output" and v.group in GROUPS]
