@@ -365,3 +365,18 @@ def test_provenance_is_there_before_the_first_message(run, tmp_path):
         bag.write(sample(run, 0))
     assert json.loads(before)["fmu"]["guid"] == run.fmu.guid
     assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"axes": "qq"}, "its axes 'qq' are not different letters of 'xyz'"),
+        ({"inputs_known_until": "x"}, "it is damaged"),
+    ],
+)
+def test_a_forged_value_of_the_provenance_is_refused(native_path, tmp_path, change, message):
+    twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.02)
+    file = tmp_path / "bag/run.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(twodof.TwoDofError, match=message):
+        twodof.read_bag(tmp_path / "bag")

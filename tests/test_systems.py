@@ -125,12 +125,12 @@ def test_units_are_converted_and_not_where_that_is_suppressed(plant: bytes, tmp_
 
 
 def test_a_connector_may_repeat_the_unit_of_its_variable(plant: bytes, tmp_path: Path) -> None:
-    """It has few digits, another name, or no definition; values have the unit of the FMU's variable."""
+    """It has few digits or another name; values have the unit of the FMU's variable."""
     rounded = '<ssc:Unit name="degree"><ssc:BaseUnit rad="1" factor="0.0174533"/></ssc:Unit>'
     settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
     degrees, plain = pd_fmu(unit="deg", factor=np.pi / 180.0), ssd(f"{BOTH}<ssd:Connections>{WIRES}</ssd:Connections>")
     expected = q_of(loop(tmp_path / "plain.ssp", plant, degrees, plain), **settings)
-    for unit in ("degree", "deg", "undefined"):
+    for unit in ("degree", "deg"):
         own = component("pd", connectors({f"q[{i}]": f"input {unit}" for i in (1, 2)}))
         both = BOTH.replace(component("pd"), own)
         text = ssd(f"{both}<ssd:Connections>{WIRES}</ssd:Connections>", f"<ssd:Units>{DEGREE}{rounded}</ssd:Units>")
@@ -449,6 +449,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     for kind, text, message in (
         ("<ssc:Real{}/>", "input deg", r"'pd\.q\[1\]' states the unit 'deg', and its FMU another, 'rad'"),
         ("<ssc:Real{}/>", "input turn", r"'pd\.q\[1\]' states the unit 'turn', and its FMU another, 'rad'"),
+        ("<ssc:Real{}/>", "input furlong", r"the unit 'furlong' without a definition, and its FMU 'rad'"),
         ("<ssc:Real/>", "output", r"'pd\.q\[1\]' states the kind output, and its FMU input"),
         ("<ssc:Integer/>", "input", r"'pd\.q\[1\]' states the type Integer, and its FMU Real"),
     ):

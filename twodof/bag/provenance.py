@@ -227,8 +227,10 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
             return {}
         content = parsed(text)
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
-            if not fits(content, SHAPE):
+            if not fits(content, SHAPE) or not fits(content.get(KNOWN_UNTIL, 0.0), NUMBER):
                 raise ValueError("it is damaged")
+            if len({*content["axes"]} & {*"xyz"}) < len(content["axes"]):
+                raise ValueError(f"its axes '{content['axes']:.50}' are not different letters of 'xyz'")
             return _limited(cast(Provenance, content))
     except (FileNotFoundError, NotADirectoryError):
         pass

@@ -91,6 +91,10 @@ class Wiring:
         for word, says, has in (("type", connector.type, scalar.type), ("kind", connector.kind, scalar.causality)):
             if {says, has} <= {*NUMBERS, "input", "output"} and says != has:
                 raise FmuError(f"{what} the {word} {says}, and its FMU {has}; state that of the FMU")
+        if stated.exponents is None and own.name and stated.name not in ("", own.name):
+            raise FmuError(
+                f"{what} the unit '{stated.name}' without a definition, and its FMU '{own.name}'; state that"
+            )
         if stated.exponents is None or own.exponents is None:
             return
         alike = stated.exponents == own.exponents and math.isclose(stated.factor, own.factor, rel_tol=ROUNDING)

@@ -69,7 +69,7 @@ class Experiment:
         """
         start = self.stamp_start
         # a fraction, because doubles of today's time in ns are multiples of 256
-        first = time.time_ns() if start is None else round(Fraction(start) * NANOSECONDS)
+        first = time.time_ns() if start is None else round(Fraction(min(start, LATEST_STAMP)) * NANOSECONDS)
         last = first + (self.steps * self.step * NANOSECONDS if self.steps < inf else 0)
         if not 0 <= first <= last <= LATEST_STAMP:
             whose = "the wall clock" if start is None else f"stamp_start = {start:g} s"
