@@ -66,7 +66,7 @@ LIBRARIES = {
 }
 
 FOR_ALL = ("bounds", "notebook", "signatures", "version")
-MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 78
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 79
 
 
 def imported(path: Path) -> set[str]:

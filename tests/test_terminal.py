@@ -59,6 +59,17 @@ def test_streams_that_are_closed_end_no_run(closed, native_path, tmp_path):
     assert len(twodof.read_bag(tmp_path / "bag").t) == 11
 
 
+def test_a_page_is_not_written_to_a_closed_standard_output(native_path, tmp_path):
+    done = run("page", str(native_path), "-o", "-", cwd=tmp_path, shell='"$@" >&-')
+    assert (done.returncode, "argument -o: the standard output is closed" in done.stderr) == (2, True)
+
+
+def test_an_invalid_date_for_reproducible_builds_ends_no_plot(native_path, tmp_path):
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
+    done = run("plot", "bag", "-o", "plot.png", cwd=tmp_path, SOURCE_DATE_EPOCH="x")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("backend", ["module://a_package.that_is_not_here", "a name that matplotlib does not know"])
 def test_a_backend_of_matplotlib_that_is_not_here_ends_no_plot(backend, native_path, tmp_path):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)

@@ -20,7 +20,7 @@ from .options import (
     parse_locks,
     parse_settings,
 )
-from .printing import busy, print_next, print_table, quote, say
+from .printing import busy, print_next, print_table, quote, say, written
 
 
 def add(build: Parser) -> None:
@@ -104,14 +104,14 @@ def call(options: argparse.Namespace) -> int:
     if not path.is_file():  # a pipe, from which nothing is read back
         return 0
     if options.part == "split":
-        print_table(("system", f"{path} ({path.stat().st_size / 1024:.0f} KB)"))
+        print_table(("system", written(path)))
         print_next(f"twodof run {quote(path)}", f"twodof info {quote(path)}")
         return 0
     from ..fmu import load_any_fmu
 
     fmu = load_any_fmu(path)
     print_table(
-        ("FMU", f"{path} ({path.stat().st_size / 1024:.0f} KB, {', '.join(fmu.platforms)})"),
+        ("FMU", written(path, *fmu.platforms)),
         ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
         ("controlled", controlled(fmu)),
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from .help import Parser
 from .options import not_empty
-from .printing import print_table
+from .printing import print_table, written
 
 
 def add(export: Parser) -> None:
@@ -24,6 +24,5 @@ def call(options: argparse.Namespace) -> int:
     from ..bag.exports import export_bag
 
     path = export_bag(options.bags, options.output)
-    size = sum(file.stat().st_size for file in [path, *path.rglob("*")] if file.is_file())
-    print_table(("bag", ", ".join(map(str, options.bags))), ("file", f"{path} ({size / 1024:.0f} KB)"))
+    print_table(("bag", ", ".join(map(str, options.bags))), ("file", written(path)))
     return 0

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from ..errors import choice, nearest
+from ..plant.numerals import number, whole_number
 from .completion import Completer
 from .printing import plain
 
@@ -105,6 +106,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **named: Any) -> None:
         super().__init__(allow_abbrev=False, **named)
+        self.register("type", float, number)
+        self.register("type", int, whole_number)
         self._optionals.title = "options (defaults in parentheses)"
 
     def add_argument(self, *names: str, completer: Completer | None = None, **named: Any) -> argparse.Action:

@@ -67,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost a tenth of a short run
     os.environ.pop("MPLBACKEND", None)  # a notebook's backend may not be installed here
+    os.environ.pop("SOURCE_DATE_EPOCH", None)  # NumPy fails to load if it is invalid; no output has a date
     try:
         options = _options(arguments)
         with _facts_beside(getattr(options, "output", None) or getattr(options, "export", None)):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable, Iterable
+from fcntl import F_GETFL, fcntl
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from ..plant.numerals import number
 from . import completion
 from .help import Parser
 
@@ -39,6 +42,8 @@ STANDARD_OUTPUT = "/dev/stdout"
 
 def output_file(text: str) -> str:
     """Return the path of an output file; "-" is the standard output."""
+    if text == "-" and fcntl(1, F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+        raise argparse.ArgumentTypeError("the standard output is closed")
     return STANDARD_OUTPUT if text == "-" else not_empty(text)
 
 
@@ -163,7 +168,7 @@ def _parse_value(name: str, text: str) -> Setting:
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [number(part) for part in text.split(",")]
     except ValueError:
         raise CommandLineError(
             f"{name}={text}: '{text}' is not a number; write numbers as 0.2,0.1 without units, or true or false"
@@ -177,7 +182,7 @@ def parse_locks(texts: Iterable[str]) -> dict[str, float]:
     for text in texts:
         name, equals, value = text.partition("=")
         try:
-            locks[name] = float(value) if equals else 0.0
+            locks[name] = number(value) if equals else 0.0
         except ValueError:
             raise CommandLineError(f"--lock {text}: '{value}' is not a number") from None
     return locks

@@ -5,7 +5,7 @@ import argparse
 from .fmus import chosen_fmu, is_robot
 from .help import Parser
 from .options import add_fmu, add_options, add_output, output_file, parse_settings
-from .printing import busy, print_table
+from .printing import busy, print_table, written
 
 
 def add(page: Parser) -> None:
@@ -30,6 +30,5 @@ def call(options: argparse.Namespace) -> int:
     output = options.output or free_name(fmu.stem, ".html", is_page)
     with busy(f"compiling {fmu} for the browser"):
         path = page(fmu, output, step=options.step, settings=settings)
-    size = path.stat().st_size / 1024
-    print_table(("FMU", str(fmu)), ("page", f"{path} ({size:.0f} KB); it needs no network"))
+    print_table(("FMU", str(fmu)), ("page", f"{written(path)}; it needs no network"))
     return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from .completion import joints
 from .help import Parser
 from .options import CommandLineError, add_options, add_output, add_robot_options, output_file
-from .printing import print_table
+from .printing import print_table, written
 from .sweep import print_best
 
 if TYPE_CHECKING:
@@ -83,4 +83,4 @@ def _show_or_save(drawing: Drawing, output: str | None, *results: tuple[str, str
     if output is None and sys.stdout.isatty() and show(drawing):
         return
     path = save(drawing, output)
-    print_table(("plot", f"{path} ({path.stat().st_size / 1024:.0f} KB)"), *results)
+    print_table(("plot", written(path)), *results)

@@ -66,6 +66,14 @@ def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.lju
         say(before + "  ".join(map(align, row, widths)).rstrip())
 
 
+def written(path: Path, *facts: str) -> str:
+    """Return an output with its size and further facts; a pipe has no size."""
+    files = [file for file in (path, *path.rglob("*")) if file.is_file()]
+    size = [f"{sum(file.stat().st_size for file in files) / 1024:.0f} KB"] if files else []
+    inside = ", ".join([*size, *facts])
+    return f"{path} ({inside})" if inside else str(path)
+
+
 def print_next(*commands: str) -> None:
     """Print the next command to type in this shell, if its packages are installed."""
     from ..version import install

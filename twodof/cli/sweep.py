@@ -11,6 +11,8 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..bounds import MAX_RUNS
+from ..plant.numerals import number
 from .completion import variables
 from .fmus import fast_fmu
 from .help import Parser
@@ -164,16 +166,14 @@ def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
     """Return the grids of --grid: evenly spaced values, including both ends."""
     import numpy as np
 
-    from ..bounds import MAX_RUNS
-
     grids: dict[str, tuple[float, ...]] = {}
     for text in texts:
-        name, (low, high, number) = _parse("--grid", text, "NAME=LOW:HIGH:COUNT", grids)
-        if number != int(number) or number < 2:
-            raise CommandLineError(f"--grid {text}: COUNT {number:g} must be a whole number of at least 2")
-        if number > MAX_RUNS:
+        name, (low, high, count) = _parse("--grid", text, "NAME=LOW:HIGH:COUNT", grids)
+        if count != int(count) or count < 2:
+            raise CommandLineError(f"--grid {text}: COUNT {count:g} must be a whole number of at least 2")
+        if count > MAX_RUNS:
             raise CommandLineError(f"--grid {text}: COUNT must be at most {MAX_RUNS}")
-        grids[name] = tuple(np.linspace(low, high, int(number)).tolist())
+        grids[name] = tuple(np.linspace(low, high, int(count)).tolist())
     return grids
 
 
@@ -189,7 +189,7 @@ def _parse(option: str, text: str, form: str, before: Iterable[str]) -> tuple[st
     name, equals, value = text.partition("=")
     name = name.strip()
     try:
-        numbers = [float(part) for part in value.split(":")]
+        numbers = [number(part) for part in value.split(":")]
     except ValueError:
         numbers = []
     if not equals or not name or len(numbers) != form.count(":") + 1:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..plant.numerals import number
 from ..plant.urdf import RobotError, Urdf
 from .kinematics import Array, Placement
 from .meshes import Colour, Meshes, ReadMesh, Surface
@@ -71,7 +72,7 @@ def _file(element: ET.Element) -> str:
 def _surfaces(element: ET.Element, meshes: Meshes) -> list[Surface]:
     """Return the surfaces of a URDF geometry; none for an unknown kind or an unusable mesh."""
 
-    def number(key: str) -> float:
+    def size(key: str) -> float:
         (value,) = floats(element, key, "1")
         return float(value)
 
@@ -81,9 +82,9 @@ def _surfaces(element: ET.Element, meshes: Meshes) -> list[Surface]:
         corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
         return [Surface(corners * floats(element, "size", "1 1 1"), BOX, None)]
     if element.tag == "sphere":
-        return [Surface(*sphere(number("radius")), None)]
+        return [Surface(*sphere(size("radius")), None)]
     if element.tag == "cylinder":
-        return [Surface(*cylinder(number("radius"), number("length")), None)]
+        return [Surface(*cylinder(size("radius"), size("length")), None)]
     return []
 
 
@@ -152,7 +153,7 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
         ValueError: it has another number of values, or a value that is not a number.
     """
     text = default if element is None else element.get(key, default)
-    numbers = np.array([float(word) for word in text.split()])
+    numbers = np.array([number(word) for word in text.split()])
     if not np.isfinite(numbers).all():
         raise ValueError(f"{key}='{text}' is not finite")
     return numbers

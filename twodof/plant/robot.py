@@ -13,7 +13,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from .urdf import NUMERIC_TAGS, UNBOUNDED, Joint, RobotError, Urdf, attribute, check_axes, number, read_urdf
+from .numerals import number
+from .urdf import NUMERIC_TAGS, UNBOUNDED, Joint, RobotError, Urdf, attribute, check_axes, read_urdf
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from .numerals import number
+
 UNBOUNDED = 1.7976931348623157e308
 """Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
 
@@ -294,13 +296,6 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
                     if tag == "limit" and not any(map(math.isnan, numbers)):
                         continue  # a huge value is a common way to write "no limit"
                     raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not finite or too large")
-
-
-def number(word: str) -> float:
-    """Parse a number without Python's underscores and non-ASCII digits, as other readers of URDFs do."""
-    if not word.isascii() or "_" in word:
-        raise ValueError(word)
-    return float(word)
 
 
 def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> str:

@@ -12,6 +12,7 @@ from ..files import check_file
 from ..fmu import Fmu, no_variable
 from ..fmu import Setting as Setting
 from ..fmu import resolve as resolve
+from ..plant.numerals import number
 from ..plant.variables import GAINS
 from ..plant.variables import Value as Value
 
@@ -56,22 +57,20 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     if twice is not None:
         raise InputError(f"'{path}' has two columns for '{twice:.50}'")
     changes: Changes = []
-    for number, row in rows:
+    for line, row in rows:
         if len(row) != len(header):
-            raise InputError(f"'{path}' row {number}: {len(row)} cells, expected {len(header)}")
+            raise InputError(f"'{path}' row {line}: {len(row)} cells, expected {len(header)}")
         values: dict[str, Value] = {}
         for name, cell in zip(header, row, strict=True):
             try:
-                if "_" in cell or not cell.isascii():  # which Python takes
-                    raise ValueError
-                values[name] = float(cell)
+                values[name] = number(cell)
             except ValueError:
-                raise InputError(f"'{path}' row {number}: {name} = '{cell:.50}' is not a number") from None
+                raise InputError(f"'{path}' row {line}: {name} = '{cell:.50}' is not a number") from None
             if not isfinite(values[name]):
-                raise InputError(f"'{path}' row {number}: {name} = {cell:.50} is not finite")
+                raise InputError(f"'{path}' row {line}: {name} = {cell:.50} is not finite")
         time = values.pop("time")
         if changes and time < changes[-1][0]:
-            raise InputError(f"'{path}' row {number}: time {time:g} is before the row above")
+            raise InputError(f"'{path}' row {line}: time {time:g} is before the row above")
         spread = {element: v for name, v in values.items() for element in elements[name]}
         changes.append((time, spread))
     if not changes:

@@ -198,7 +198,8 @@ class Judge:
             largest = _largest(own["tau"])
             self.effort = np.maximum(self.effort, largest)
             before = own["tau"][:1] if not self.count else self._of(self.last, "tau")[None]
-            self.chatter += np.square(np.diff(own["tau"], axis=0, prepend=before)).sum(axis=0)
+            with np.errstate(over="ignore"):  # infinite from efforts of 1e154 N·m on
+                self.chatter += np.square(np.diff(own["tau"], axis=0, prepend=before)).sum(axis=0)
             bound = np.array(setup.limits.effort) * (1.0 - EXACT)
             if (largest >= bound).any():
                 self.saturated += (np.abs(own["tau"]) >= bound).sum(axis=0)
