@@ -13,8 +13,6 @@ import pytest
 from friction_oracle import Rubbing
 from native_models import Engine, Model, Reduced, engine, from_urdf, model
 
-from twodof.plant.plant import DiscardError
-
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 SLIDER = """<robot name="slider"><link name="base"/><link name="body"><inertial><mass value="2"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -224,17 +222,13 @@ def test_mujoco_agrees_when_each_joint_sticks(seed):
 @pytest.mark.parametrize("friction", [1e-300, 1e-12, 1e12, 1e300])
 @pytest.mark.parametrize("speed", [0.0, 1.0])
 @pytest.mark.parametrize("control", ["effort", "joint"])
-def test_friction_of_any_size_is_right_or_refused(friction, speed, control):
+def test_friction_of_any_size_is_right(friction, speed, control):
     native, ends = engine("ur5", control), []
     for python in (False, True):
         plant = model("ur5", control).plant()
         plant.friction, plant.v = [friction] * 6, [speed] * 6
         if control == "joint":
             plant.Kp = plant.Kd = [0.0] * 6
-        if friction * speed == 1e300:
-            with pytest.raises((AssertionError, DiscardError)):
-                list(states(native, plant, 0.01, 1, python=python))
-            continue
         q, v = list(states(native, plant, 0.01, 5, python=python))[-1]
         ends.append(np.r_[q, v])
         if friction > 1.0:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import RK45
 
-from twodof.plant import dormand_prince, integrator
+from twodof.plant import dormand_prince, integrator, regime
 from twodof.plant.equations import Equations
 from twodof.plant.step_error import StepError
 from twodof.plant.stops import Stops
@@ -43,8 +43,8 @@ def jumping(acceleration, ratio):
 @pytest.fixture
 def budget(monkeypatch):
     """A number of evaluations of a step that is too small."""
-    monkeypatch.setattr(integrator, "BUDGET", 20_000)
-    return integrator.BUDGET
+    monkeypatch.setattr(regime, "BUDGET", 20_000)
+    return regime.BUDGET
 
 
 def test_coefficients_are_those_of_scipy():

@@ -14,7 +14,7 @@ import pytest
 from native_models import Engine, damped_arm, engine, from_urdf, model, shipped
 from scipy.integrate import solve_ivp
 
-from twodof.plant import integrator
+from twodof.plant import regime
 from twodof.plant.plant import Plant
 
 STEP = 0.01
@@ -411,7 +411,7 @@ def test_a_release_that_ends_between_two_looks_at_the_effort_is_found_by_both_fl
 @pytest.mark.parametrize("name", ["tiago", "tiago_dual"])
 def test_many_joints_at_stops_need_few_evaluations(name, friction, monkeypatch):
     """Bare robots with hands fall onto rigid stops; a step needs at least 60 evaluations."""
-    monkeypatch.setattr(integrator, "BUDGET", 950)
+    monkeypatch.setattr(regime, "BUDGET", 800)
     plant = model(f"tiago_description/robots/{name}.urdf", "effort").plant()
     limits = list(zip(plant.q_min, plant.q_max))
     plant.q_start = [0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in limits]

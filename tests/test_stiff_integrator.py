@@ -13,8 +13,8 @@ from test_stiffness import radau
 
 from twodof.plant import rosenbrock
 from twodof.plant.dormand_prince import interpolant
-from twodof.plant.integrator import AUTOMATIC, DORMAND_PRINCE, STIFF
 from twodof.plant.plant import Plant
+from twodof.plant.regime import AUTOMATIC, DORMAND_PRINCE, STIFF
 
 STEP = 0.01
 TIGHT = {"rtol": 1e-9, "atol": 1e-12}

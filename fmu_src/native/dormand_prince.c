@@ -28,6 +28,7 @@ static const double P[STAGES + 1][4] = {
     {0, -282668133.0 / 205662961, 2019193451.0 / 616988883, -1453857185.0 / 822651844},
     {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
 };
+static const double QUADRATIC[2][4] = {{1, -0.5, 0, 0}, {0, 0.5, 0, 0}};
 
 void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS],
               double *margin)
@@ -80,6 +81,23 @@ double dormand_prince(Step *step)
     }
     step->stages = STAGES;
     step->P = P;
+    return error_norm(step, error);
+}
+
+double heun(Step *step)
+{
+    double error[N_STATES];
+    const double *k = step->K[0], *k_new = step->K[1];
+    for (int i = 0; i < N_STATES; i++)
+        step->y_new[i] = step->y[i] + step->size * k[i];
+    memcpy(step->K[1], step->y_new + N_JOINTS, N_JOINTS * sizeof *k);
+    evaluate(step, step->y_new, step->K[1] + N_JOINTS, step->effort[1], &step->margin_new);
+    for (int i = 0; i < N_STATES; i++) {
+        error[i] = 0.5 * step->size * (k_new[i] - k[i]);
+        step->y_new[i] += error[i];
+    }
+    step->stages = 1;
+    step->P = QUADRATIC;
     return error_norm(step, error);
 }
 

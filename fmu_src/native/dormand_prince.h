@@ -8,7 +8,7 @@
 
 enum { STAGES = 6 }; /* evaluations of the equations of motion in one step */
 
-/* One integration step from y to y_new in one regime, by Dormand–Prince or ROS34PW2. The first and the last of the
+/* One integration step from y to y_new in one regime, by Dormand–Prince, ROS34PW2 or Heun. The first and the last of the
    derivatives K are those at the ends; the last stage is y_new. */
 typedef struct {
     const Plant *plant;
@@ -36,6 +36,10 @@ INTERNAL double error_norm(const Step *step, const double error[N_STATES]);
 
 /* Fill y_new, K[1…6] and P from y and K[0]; return the norm of the error. A step passes if it is below 1. */
 INTERNAL double dormand_prince(Step *step);
+
+/* The same with a method of second order, with K[0…1], of which K[1] is at the state of Euler's method; its error is
+   the norm. */
+INTERNAL double heun(Step *step);
 
 /* Fill Q, for dense_output. */
 INTERNAL void interpolate(Step *step);

@@ -23,6 +23,8 @@ static const double FINEST_TOLERANCE = 1.0 / 68719476736.0; /* 2⁻³⁶ */
 static const double NUDGE = 1e-6;
 /* Fraction of the largest step. Joints that an impact moves, and that come to rest within it, stop with the impact. */
 static const double WINDOW = 1.0 / 8192.0; /* 2⁻¹³ */
+/* Largest short step, by which an event soon is reached, as a fraction of the largest step. */
+static const double SHORT = 1.0 / 16.0;
 
 /* Determine the regime at y, where joints may rest. */
 static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
@@ -88,6 +90,46 @@ static double share_of_tolerance(const Step *step)
     return fmin(1.0, fmax(step->size / value[MAX_STEP], FINEST_TOLERANCE / value[RTOL]));
 }
 
+/* First positive time at which distance + v t + a t²/2 is zero, for a distance ≥ 0 and v < 0 or a < 0; or HUGE_VAL. */
+static double first_zero(double distance, double v, double a)
+{
+    const double root = sqrt(fmax(v * v - 2.0 * a * distance, 0.0));
+    if (v >= 0.0)
+        return -(v + root) / a;
+    return v * v < 2.0 * a * distance ? HUGE_VAL : 2.0 * distance / (root - v);
+}
+
+/* Time after which a constant acceleration would stop a joint at a limit or by friction, if it is at most `most`; else
+   HUGE_VAL. */
+static double expected_stop(const Step *step, double most)
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    double first = HUGE_VAL;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double q = step->y[i], v = step->K[0][i], a = step->K[0][N_JOINTS + i];
+        const double reach = (fabs(v) + fabs(a) * most) * most;
+        if (step->stops.held[i])
+            continue;
+        if (step->stops.slip[i] * v > 0.0 && step->stops.slip[i] * a < 0.0)
+            first = fmin(first, -v / a);
+        if (q - low[i] < reach && (v < 0.0 || a < 0.0))
+            first = fmin(first, first_zero(q - low[i], v, a));
+        if (high[i] - q < reach && (v > 0.0 || a > 0.0))
+            first = fmin(first, first_zero(high[i] - q, -v, -a));
+    }
+    return first <= most ? first : HUGE_VAL;
+}
+
+/* Try to reach the next event by a short step of one evaluation; return the time of the event in it, 0 without one. */
+static double short_step(Step *step, double left, int rank_held, Event *event)
+{
+    const double most = SHORT * step->plant->value[MAX_STEP];
+    step->size = fmin(2.0 * expected_stop(step, 0.5 * most), left);
+    if (!(0.0 < step->size && step->size <= most) || !(heun(step) / share_of_tolerance(step) < 1.0))
+        return 0.0;
+    return first_event(step, rank_held, event);
+}
+
 /* Integrate from the time t and the state y until an event or the end; return the time, with y the state there, or NaN
    on failure. */
 static double until_event(Step *step, double t, double end, int rank_held, int *integrator, Event *event,
@@ -97,6 +139,11 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
     if (all_rest(step))
         return end;
+    const double soon = *integrator == STIFF ? 0.0 : short_step(step, end - t, rank_held, event);
+    if (soon > 0.0) {
+        memcpy(step->y, step->y_new, sizeof step->y);
+        return soon == end - t ? end : t + soon;
+    }
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;

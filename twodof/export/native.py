@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from ..plant.integrator import BUDGET
+from ..plant.regime import BUDGET
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, FREE, ON_REQUEST, RANGES, Variable, count_event_indicators
 

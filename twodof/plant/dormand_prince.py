@@ -1,6 +1,6 @@
-"""One step of Dormand–Prince 5(4) and its interpolant.
+"""One step of Dormand–Prince 5(4), or of Heun's method, and its interpolant.
 
-Coefficients, error norm and dense output are those of SciPy's ``RK45``.
+Coefficients, error norm and dense output of the former are those of SciPy's ``RK45``.
 Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986.
 """
 
@@ -36,6 +36,7 @@ P = np.array(
         [0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
     ]
 )
+HEUN = np.array([[1.0, -0.5, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0]])
 STAGES = 6
 """Evaluations of the right-hand side in one step."""
 FINEST_TOLERANCE = 2.0**-36
@@ -69,6 +70,22 @@ def dormand_prince(rates: Callable[[State], State], y: State, step: float, k1: S
     a, _, b, c, d, e = s7
     y_new = [u + (a * p + b * q + c * r + d * s + e * t) for u, p, q, r, s, t in zip(y, k1, k3, k4, k5, k6)]
     return y_new, [k1, k2, k3, k4, k5, k6, rates(y_new)]
+
+
+def heun(
+    rates: Callable[[State], State], y: State, step: float, k1: State, rtol: float, atol: float
+) -> tuple[State, list[State], float]:
+    """Take one step of Heun's method, of second order, with one evaluation.
+
+    Returns:
+        y_new; the derivatives for ``HEUN``, the second at the state of Euler's method; and the norm of the error of
+        Euler's method.
+    """
+    k2 = rates([u + step * p for u, p in zip(y, k1)])
+    errors = [0.5 * step * (q - p) for p, q in zip(k1, k2)]
+    y_new = [u + step * p + e for u, p, e in zip(y, k1, errors)]
+    ratios = [e / (atol + rtol * max(abs(u), abs(w))) for e, u, w in zip(errors, y, y_new)]
+    return y_new, [k1, k2], sqrt(sum(ratio * ratio for ratio in ratios) / len(y))
 
 
 def error_norm(K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float) -> float:

@@ -8,9 +8,12 @@ require.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from math import inf
+from math import inf, sqrt
 
 import numpy as np
+
+from .dormand_prince import State
+from .stops import Stops
 
 Margin = Callable[[float], float]
 """A function of the time within the step that is negative after the end of the step's regime."""
@@ -50,6 +53,34 @@ class Event:
 
     stopped: list[int] = field(default_factory=list)
     arrested: list[int] = field(default_factory=list)
+
+
+def first_zero(distance: float, v: float, a: float) -> float:
+    """Return the first positive time at which distance + v t + a t²/2 is 0, or infinity.
+
+    The distance is not negative, and v or a is negative.
+    """
+    square = v * v - 2.0 * a * distance
+    if v >= 0.0:
+        return -(v + sqrt(square)) / a
+    return 2.0 * distance / (sqrt(square) - v) if square >= 0.0 else inf
+
+
+def expected_stop(y: State, rates: State, stops: Stops, most: float) -> float:
+    """Return when a constant acceleration stops a joint at a limit or by friction; infinity if after ``most`` s."""
+    n, first = len(stops.limits), inf
+    for i, (low, high) in enumerate(stops.limits):
+        q, v, a = y[i], rates[i], rates[n + i]
+        if i in stops.held:
+            continue
+        if stops.slip[i] * v > 0.0 > stops.slip[i] * a:
+            first = min(first, -v / a)
+        reach = (abs(v) + abs(a) * most) * most
+        if q - low < reach and (v < 0.0 or a < 0.0):
+            first = min(first, first_zero(q - low, v, a))
+        if high - q < reach and (v > 0.0 or a > 0.0):
+            first = min(first, first_zero(high - q, -v, -a))
+    return first if first <= most else inf
 
 
 def search(

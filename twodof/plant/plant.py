@@ -20,9 +20,9 @@ from . import effort_control, joint_control, task_control
 from .control_law import ControlLaw, ControlledPlant
 from .dormand_prince import STAGES
 from .equations import Answer, Array, Equations, Law, Response
-from .integrator import BUDGET
 from .mechanism import Mechanism
 from .orientation import quaternion
+from .regime import BUDGET
 from .robot import Robot
 from .sampling import Sampling, advance_sampled, sampling_refusal
 from .step_error import StepError

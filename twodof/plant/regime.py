@@ -1,0 +1,270 @@
+"""Motion in one regime, integrated until an event.
+
+A regime is the set of joints at rest, the directions in which the others slip (``stops``), and the rank of J⁺. An event
+ends it. The event is located within an integration step (``event_search``); the step ends there, and the next one
+begins in another regime. A step is accepted only if its error test passes. The step-size control is that of SciPy's
+``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I", II.4).
+
+Where a joint is expected to stop soon, a short step of one evaluation tries to reach that event. Without an event in
+it, it is discarded. Impacts on many joints with friction are followed by such events within microseconds.
+
+After a change of the rank, steps share the tolerances: motion back and forth across a singularity takes so many steps
+that their errors would add up to energy.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import chain
+from math import inf, isfinite, isnan, nan, ulp
+from struct import Struct
+
+import numpy as np
+
+from . import event_search as events
+from .dormand_prince import HEUN, Array, P, State, dormand_prince, error_norm, heun, interpolant, shared_tolerance
+from .equations import Equations
+from .pseudo_inverse import rank_margin
+from .rosenbrock import CUBIC, damping_limits, rosenbrock
+from .step_error import StepError, fastest_joint
+from .stops import Stops
+
+SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
+SHORT = 1.0 / 16.0
+"""Longest short step, as a fraction of the largest step."""
+AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
+"""Values of the parameter ``integrator``."""
+BUDGET = 2_000_000
+"""Most evaluations of the right-hand side in one communication step; only a stiff motion would need more."""
+MOST_ROWS = 6
+"""Largest number of rows of a task Jacobian: three axes, and three for an orientation."""
+
+
+class Motion:
+    """The equations of motion in one regime, as a system of first order.
+
+    Attributes:
+        rank: rank of J⁺ in this regime.
+        rank_held: whether the rank must not rise in this regime.
+        crossed: whether the rank has changed in the communication step.
+        evaluations: evaluations of the right-hand side so far.
+        grips, margins: the result of ``Stops.restrain``, and the margin of the rank, at each stage of the present step.
+    """
+
+    def __init__(
+        self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float, integrator: int
+    ) -> None:
+        n = len(stops.limits)
+        self._equations = equations
+        state = np.empty(2 * n)
+        self._write = Struct(f"{2 * n}d").pack_into  # quicker than numpy at this size
+        self._buffer, self._q, self._v = state.data, state[:n], state[n:]
+        self.n, self.evaluations = n, 0
+        self.stops, self.rtol, self.atol, self.max_step = stops, rtol, atol, max_step
+        self.coarseness = min(1.0, rtol / events.USUAL_RTOL)
+        self._damping = np.array(equations.damping) if len(equations.damping) else np.zeros(n)
+        self._automatic = integrator == AUTOMATIC and bool(len(equations.damping))
+        self._stiff = integrator == STIFF
+        self.rank = MOST_ROWS
+        self.rank_held = self.crossed = False
+        self.grips: list[list[float]] = []
+        self.margins: list[float] = []
+
+    def set_out(self, y: State, anti_chatter: Sequence[bool], kept: Sequence[bool], rank_held: bool) -> State:
+        """Apply an impact and determine the regime after it; return ẏ in it.
+
+        Args:
+            y: the state (q, v); changed.
+            anti_chatter: joints that stop in both directions.
+            kept: joints that stay at rest even if the holding effort exceeds its bounds.
+            rank_held: whether the rank stays as it is.
+        """
+        self.rank_held, rank = rank_held, self.rank if rank_held else None
+        hits = self.stops.impact(y, anti_chatter) and self.stops.rigid
+        self.stops.slide(y[self.n :])
+        a, self.rank, margin = self._acceleration(y, rank)
+        if hits and self.stops.stop_within(events.WINDOW * self.max_step * self.coarseness, y, a, kept):
+            self.stops.slide(y[self.n :])
+            a, self.rank, margin = self._acceleration(y, rank)
+        self.grips, self.margins = [self.stops.hold(y, a, kept)], [margin]
+        return y[self.n :] + a
+
+    def acceleration(self, y: State) -> tuple[list[float], list[float], float]:
+        """Return q̈ at y in the regime, the result of ``Stops.restrain``, and the margin of the rank."""
+        a, _, margin = self._acceleration(y, self.rank)
+        return a, self.stops.restrain(y, a), margin
+
+    def _acceleration(self, y: State, rank: int | None) -> tuple[list[float], int, float]:
+        self.evaluations += 1
+        self._write(self._buffer, 0, *y)
+        a, rank, margin = self._equations.acceleration(self._q, self._v, rank, self.stops.slip)
+        return list(a), rank, margin
+
+    def rates(self, y: State) -> State:
+        """Return ẏ at a stage of a step; NaN if the equations have no solution there."""
+        try:
+            a, grips, margin = self.acceleration(y)
+        except np.linalg.LinAlgError:
+            a, grips, margin = [nan] * self.n, [nan] * len(self.grips[0]), nan
+        self.grips.append(grips)
+        self.margins.append(margin)
+        return y[self.n :] + a
+
+    def tolerance(self, q: float) -> float:
+        """Return the tolerance of the error test on a position."""
+        return self.atol + self.rtol * abs(q)
+
+    def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
+        """Integrate from t, with ẏ at y, until an event or the end; return the time, the state and the event."""
+        if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
+            return end, y, events.Event()  # inputs and all joints are held: nothing changes
+        soon = None if self._stiff else self._short_step(y, rates, end - t)
+        if soon is not None:
+            passed, y, event = soon
+            return end if passed == end - t else t + passed, y, event
+        step, growth = min(self.max_step, end - t), MAX_FACTOR
+        while True:
+            last = t + step * (1 + 1e-9) >= end
+            if last:
+                step = end - t
+            del self.grips[1:], self.margins[1:]
+            if self._stiff:
+                mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
+                y_new, K, norm = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances)
+            else:
+                y_new, K = dormand_prince(self.rates, y, step, rates)
+                norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
+            norm /= self._share(step)
+            factor = MIN_FACTOR
+            if isfinite(norm):
+                order = (3 if self._stiff else 5) - self.crossed
+                factor = SAFETY * norm ** (-1 / order) if norm > 0.0 else MAX_FACTOR
+            if norm < 1.0:
+                found = self._first_event(y, y_new, step, K, CUBIC if self._stiff else P)
+                if found is not None:
+                    passed, y, event = found
+                    return end if last and passed == step else t + passed, y, event
+                if last:
+                    return end, y_new, events.Event()
+                t, y, rates = t + step, y_new, K[-1]
+                self.grips[0], self.margins[0] = self.grips[-1], self.margins[-1]
+                step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
+                growth = MAX_FACTOR
+            elif self._automatic and damping_limits(
+                self.stops.mobility(y[: self.n]), self._damping, K, step, min(self.max_step, end - t)
+            ):
+                self._stiff, self._automatic = True, False  # until the end of the communication step
+            else:
+                step *= max(MIN_FACTOR, factor)
+                growth = 1.0  # SciPy's rule: no growth right after a rejection
+                if step < 10 * ulp(end):
+                    if not all(map(isfinite, chain(*K))):
+                        raise FloatingPointError(
+                            "the equations of motion gave a value that is not finite:"
+                            " inputs, payload or speeds are too large"
+                        )
+                    raise self._too_fast(y, too_fine=True)
+            if self.evaluations > BUDGET:
+                raise self._too_fast(y, too_fine=False)
+
+    def _share(self, step: float) -> float:
+        """Return the fraction of the tolerances that a step may use."""
+        return shared_tolerance(step / self.max_step, self.rtol) if self.crossed else 1.0
+
+    def _short_step(self, y: State, rates: State, left: float) -> tuple[float, State, events.Event] | None:
+        """Return the result of ``_first_event`` in a short step to an event that is expected soon."""
+        most = SHORT * self.max_step
+        expected = events.expected_stop(y, rates, self.stops, 0.5 * most)
+        step = min(2.0 * expected, left)
+        if not 0.0 < step <= most:
+            return None
+        del self.grips[1:], self.margins[1:]
+        y_new, K, norm = heun(self.rates, y, step, rates, self.rtol, self.atol)
+        return self._first_event(y, y_new, step, K, HEUN) if norm / self._share(step) < 1.0 else None
+
+    def _too_fast(self, y: State, *, too_fine: bool) -> StepError:
+        joint, rate = fastest_joint(lambda at: self.acceleration(at)[0], y)
+        return StepError(too_fine=too_fine, joint=joint, rate=rate)
+
+    def _first_event(
+        self, y: State, y_new: State, step: float, K: list[State], weights: Array
+    ) -> tuple[float, State, events.Event] | None:
+        """Return the time in (0, step] at which the regime ends, the state there, and the event; None without one."""
+        n, stops = self.n, self.stops
+        reach = [events.REACH * step * max(map(abs, speeds)) for speeds in zip(*(k[:n] for k in K))]
+        near = [
+            i
+            for i, (q, change, (low, high)) in enumerate(zip(y, reach, stops.limits))
+            if not (q - change > low and q + change < high) and i not in stops.held
+        ]
+        sweep = sum(map(float.__mul__, self._equations.swing, reach))
+        near_rank = not max(self.margins[0], self.margins[-1]) > sweep
+        near += [n + i for i in range(n) if self._may_be_arrested(i, y, step, K)]
+        doubtful = [i for i, grips in enumerate(zip(*self.grips)) if events.may_vanish(grips)]
+        if not near and not near_rank and not doubtful:
+            return None
+        state = interpolant(y, y_new, K, weights, step)
+        crossings = {}
+        for i in near:
+            slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(weights).tolist())]
+            crossings[i] = events.first_crossing(self._margin_of(i, state), slope, step)
+        first = min(crossings.values(), default=inf)
+
+        def grips(passed: float) -> list[float]:
+            return self.acceleration(state(passed))[1]
+
+        def singular_margin(passed: float) -> float:
+            return self._singular_margin(state(passed))
+
+        if doubtful:
+            at_ends = self.grips[0], self.grips[-1]
+            first = min(first, events.first_release(grips, at_ends, doubtful, step, first))
+        if near_rank:
+            a, b = singular_margin(0.0), singular_margin(step)
+            pace = events.PACE / events.REACH * sweep / step
+            first = min(first, events.search(singular_margin, pace, 0.0, a, step, b, step))
+        if first == inf:
+            return None
+        last = first + events.TOGETHER * self.max_step if stops.rigid else -inf
+        return first, *self._event(state(first), [i for i in crossings if i < n and crossings[i] <= last])
+
+    def _may_be_arrested(self, i: int, y: State, step: float, K: list[State]) -> bool:
+        """Return whether the velocity of a slipping joint may cross 0 within a step."""
+        slip, n = self.stops.slip[i], self.n
+        if not slip or i in self.stops.held:
+            return False
+        return not slip * y[n + i] > events.REACH * step * max(abs(k[n + i]) for k in K)
+
+    def _margin_of(self, component: int, state: Callable[[float], State]) -> events.Margin:
+        """Return the distance of a position from its limits, or the velocity in the direction of slip."""
+        if component >= self.n:
+            slip = self.stops.slip[component - self.n]
+            return lambda passed: slip * state(passed)[component]
+        low, high = self.stops.limits[component]
+
+        def distance(passed: float) -> float:
+            q = state(passed)[component]
+            return min(high - q, q - low)
+
+        return distance
+
+    def _event(self, y: State, together: Sequence[int]) -> tuple[State, events.Event]:
+        """Return a state with positions clipped to limits and reversed velocities set to 0, and its event."""
+        y, n, stops, event = list(y), self.n, self.stops, events.Event()
+        for i, (low, high) in enumerate(stops.limits):
+            if i in stops.held:
+                continue
+            side = (y[i] >= high) - (y[i] <= low)
+            if not low <= y[i] <= high or side * y[n + i] > 0.0 or i in together:
+                event.stopped.append(i)
+                y[i] = high if high - y[i] <= y[i] - low else low
+            if stops.slip[i] * y[n + i] < 0.0:
+                event.arrested.append(i)
+                y[n + i] = 0.0
+        return y, event
+
+    def _singular_margin(self, y: State) -> float:
+        """Return the margin of the rank; for a held rank, the margin to a lower rank only."""
+        self.evaluations += 1
+        ratios, rank = self._equations.ratios(np.array(y[: self.n])), self.rank
+        if self.rank_held:
+            return ratios[rank - 1] - self._equations.rcond if rank else 1.0
+        return rank_margin(ratios, self._equations.rcond, rank)
