@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from native_models import ROBOTS, Engine, Reduced, model
+from native_models import ROBOTS, Engine, Reduced, from_urdf, model, urdf_path
+from scipy.spatial.transform import Rotation
 
 from twodof.plant.stops import CLAMPED, FREE, STOPPED, STUCK
 
@@ -189,6 +190,32 @@ def test_the_jacobian_is_that_of_complex_steps(case):
         values = at_random(engine, rng, **{"f_ext": rng.normal(0, 5, 3).tolist()} | settings)
         ours, steps = engine.slopes(values)[:, first:], engine.jacobian(values)[-engine.n :, first:]
         assert np.abs(ours - steps).max() <= 1e-12 * np.abs(steps).max()
+
+
+def test_the_jacobian_of_a_robot_with_a_gear_in_its_arm_is_that_of_complex_steps():
+    urdf = urdf_path("ur5").read_text()
+    wrist, _transmission = re.findall(r'<joint name="wrist_2_joint".*?</joint>', urdf, re.DOTALL)
+    geared = wrist.replace("</joint>", '<mimic joint="shoulder_lift_joint" multiplier="-0.5"/></joint>')
+    engine = Derivatives(from_urdf(urdf.replace(wrist, geared), "tool0", "xyz"))
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        values = at_random(engine, rng, Kn=2.0, gravity=[3.0, -2.0, -9.0])
+        ours, steps = engine.slopes(values), engine.jacobian(values)[-engine.n :]
+        assert engine.n == 5
+        assert np.abs(ours - steps)[:, engine.model.index("q") :].max() <= 1e-12 * np.abs(steps).max()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.1, 0.199, 0.201, 3.0])
+def test_the_jacobian_is_that_of_complex_steps_for_errors_of_any_angle(angle):
+    """The rate of the rotation error is a series at small angles."""
+    engine, rng = Derivatives(model("ur5", "pose")), np.random.default_rng(4)
+    plant, axis = engine.model.plant(), rng.normal(size=3)
+    plant.q = rng.uniform(-1.0, 1.0, 6).tolist()
+    plant.initialise()
+    target = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)) * Rotation.from_quat(plant.quat)
+    values = at_random(engine, rng, q=plant.q, quat_des=target.as_quat().tolist())
+    ours, steps = engine.slopes(values), engine.jacobian(values)[-6:]
+    assert np.abs(ours - steps)[:, engine.model.index("q") :].max() <= 1e-12 * np.abs(steps).max()
 
 
 @pytest.mark.parametrize("rigid", [False, True])

@@ -11,6 +11,14 @@ INTERNAL int command(const double value[N_VARIABLES], const JointPosition joint[
                      const double q[N_JOINTS], const double v[N_JOINTS], int rank,
                      double given[N_JOINTS], double *margin);
 
+/* Add the derivatives of the law's accelerations, given, by q and v to slope. The motions are those under the law.
+   Returns false, and adds nothing, where J has not full rank. */
+#ifndef IS_COMPLEX
+static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                                 const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
+                                 double slope[N_JOINTS][X]);
+#endif
+
 #ifdef HAS_RCOND
 /* σ/σ_max of J at a position, in descending order. */
 INTERNAL void conditioning(const double q[N_JOINTS], double ratio[N_ROWS]);

@@ -13,3 +13,13 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
     memcpy(given, &value[TAU_CMD], N_JOINTS * sizeof *given);
     return 0;
 }
+
+#ifndef IS_COMPLEX
+static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                                 const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
+                                 double slope[N_JOINTS][X])
+{
+    (void)value, (void)joint, (void)motion, (void)given, (void)rank, (void)slope;
+    return 1;
+}
+#endif

@@ -10,6 +10,9 @@
 #elif defined HAS_RCOND
 #include "pseudo_inverse.c"
 #include "task_control.c"
+#ifndef IS_COMPLEX
+#include "task_slopes.c"
+#endif
 #else
 #include "joint_control.c"
 #endif

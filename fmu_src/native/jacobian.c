@@ -103,9 +103,12 @@ static void divide_by_mass(double M[N_JOINTS][N_JOINTS], const Stops *stops, int
 }
 
 /* Add the derivatives of the law's result by states and, from a column on, inputs to slope. */
-static void add_command(const double value[N_VARIABLES], const Stops *stops, int first, double slope[N_JOINTS][X])
+static void add_command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops,
+                        int first, const double given[N_JOINTS], const JointMotion motion[N_BODIES],
+                        double slope[N_JOINTS][X])
 {
-    for (int k = first; k < X && COMMANDS_ACCELERATION; k++) {
+    const int end = add_command_by_states(value, joint, motion, given, stops->rank, slope) ? Q : X;
+    for (int k = first; k < end && COMMANDS_ACCELERATION; k++) {
         double change[X] = {0}, derivative[FIRST_PARAMETER];
         if (k >= TAU_EXT && k < F_EXT + 3)
             continue;
@@ -131,7 +134,7 @@ static int set_law(const double value[N_VARIABLES], const JointPosition joint[N_
     if (cancels || !COMMANDS_ACCELERATION)
         return cancels;
     compute_dynamics(value, joint, 1, &value[V], given, &value[GRAVITY], all);
-    add_command(value, stops, first, slope);
+    add_command(value, joint, stops, first, given, all->motion, slope);
     for (int c = first; c < X; c++) {
         for (int i = 0; i < N_JOINTS; i++)
             column[i] = slope[i][c];
@@ -150,7 +153,7 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
     Dynamics all;
     Stops reacting = *stops;
     const int first = COMMANDS_ACCELERATION && any_reacts(stops) ? 0 : TAU_EXT;
-    int clamped = 0, cancels = 0;
+    int clamped = 0, cancels = 0, deviates = 0;
     memset(slope, 0, N_JOINTS * sizeof *slope);
     for (int i = 0; i < N_JOINTS; i++) {
         reacting.held[i] = reacts(stops, i) ? stops->held[i] : FREE;
@@ -167,10 +170,16 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
         command(value, joint, &value[Q], v, stops->rank, given, NULL);
         cancels = set_law(value, joint, stops, first, given, acts, &all, slope);
     }
-    for (int i = 0; i < N_JOINTS && cancels; i++)
+    for (int i = 0; i < N_JOINTS && cancels; i++) {
         a[i] -= given[i];
-    compute_dynamics(value, joint, 0, cancels ? nothing : v, a, cancels ? nothing : &value[GRAVITY], &all);
-    add_inverse_dynamics(&all, minus, slope);
+        deviates |= a[i] != 0.0;
+    }
+    if (cancels && !deviates) {
+        compute_dynamics(value, joint, 0, v, given, &value[GRAVITY], &all);
+    } else {
+        compute_dynamics(value, joint, 0, cancels ? nothing : v, a, cancels ? nothing : &value[GRAVITY], &all);
+        add_inverse_dynamics(&all, minus, slope);
+    }
     add_external_force(&value[F_EXT], all.motion, slope);
     for (int i = END_BODY; i >= 0; i = PARENT[i])
         for (int k = 0; k < 3; k++)
@@ -180,8 +189,10 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
         slope[i][V + i] -= value[DAMPING + i];
     }
     divide_by_mass(all.M, stops, first, slope);
+    if (cancels && deviates)
+        compute_dynamics(value, joint, 0, v, given, &value[GRAVITY], &all);
     if (cancels)
-        add_command(value, stops, first, slope);
+        add_command(value, joint, stops, first, given, all.motion, slope);
     for (int k = Q - N_FREE; k < Q; k++) { /* by parameters that are inputs */
         double change[X] = {0}, derivative[FIRST_PARAMETER];
         change[k] = 1.0;

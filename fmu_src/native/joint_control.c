@@ -14,3 +14,17 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
                    + value[KP + i] * (value[Q_DES + i] - q[i]);
     return 0;
 }
+
+#ifndef IS_COMPLEX
+static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                                 const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
+                                 double slope[N_JOINTS][X])
+{
+    (void)joint, (void)motion, (void)given, (void)rank;
+    for (int i = 0; i < N_JOINTS; i++) {
+        slope[i][Q + i] -= value[KP + i];
+        slope[i][V + i] -= value[KD + i];
+    }
+    return 1;
+}
+#endif

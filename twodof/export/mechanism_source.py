@@ -66,15 +66,18 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     terms = _terms("motion", ("s", "psi", "chi"), motions)
     terms |= _terms("force", ("coriolis", "inertial", "by_q", "by_v"), joint_forces(constants, bodies, motions))
     slopes = c_function(f"void joint_forces({motion}, JointMotion motion[N_BODIES], JointForce force[N_BODIES])", terms)
-    return "\n".join([MECHANISM, *texts, "#ifndef IS_COMPLEX", _tree(constants), slopes + "#endif\n"])
+    return "\n".join(
+        [MECHANISM, *texts, "#ifndef IS_COMPLEX", _tree(constants, rows[: len(robot.axes)]), slopes + "#endif\n"]
+    )
 
 
-def _tree(robot: JointTree) -> str:
-    """Return the joints' parents, and of each the independent joint that it follows by a ratio."""
+def _tree(robot: JointTree, axes: Sequence[int]) -> str:
+    """Return the joints' parents, of each the independent joint that it follows by a ratio, and the task's axes."""
     leaders = np.abs(robot.G).argmax(axis=1)
     ratios = robot.G[range(len(leaders)), leaders]
     rows = {"int PARENT": robot.parent, "int LEADER": leaders.tolist(), "double RATIO": ratios.tolist()}
     lines = [f"static const {name}[N_BODIES] = {{{', '.join(map(repr, row))}}};" for name, row in rows.items()]
+    lines.append(f"static const int AXIS[N_AXES] = {{{', '.join(map(str, axes))}}};")
     return "\n".join([*lines, f"enum {{ END_BODY = {robot.path[-1]} }};"])
 
 

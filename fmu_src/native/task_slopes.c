@@ -1,0 +1,185 @@
+/* Derivatives of the task law by the states, where J has full rank. The law's acceleration q̈_cmd moves the task frame
+   with the wanted acceleration w, and moves the joints beside the task by −Kn v. So with N = I − J⁺J
+
+       ẍ(q, v, q̈_cmd) = w(q, v),     N q̈_cmd = −Kn N v
+       δq̈_cmd = J⁺ (δw − δẍ) + N (δJᵀ J⁺ᵀ (q̈_cmd + Kn v) − Kn δv)
+
+   Sources: Golub & Pereyra, SIAM J. Numer. Anal. 10(2), 1973; of δẍ, as that of jacobian.c. */
+#include "control.h"
+
+#include <string.h>
+
+/* Of the joints on the way to the task frame: rows of the derivatives of the wanted and the actual acceleration, by q
+   and v, and δJᵀ y by q. */
+typedef struct {
+    double by_q[N_ROWS][N_JOINTS], by_v[N_ROWS][N_JOINTS], turned[N_JOINTS][N_JOINTS];
+} TaskSlopes;
+
+static void cross(const double a[3], const double b[3], double result[3])
+{
+    result[0] = a[1] * b[2] - a[2] * b[1];
+    result[1] = a[2] * b[0] - a[0] * b[2];
+    result[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* sum += factor (m × s) of two spatial motions. */
+static void add_motion_cross(const double m[6], const double s[6], double factor, double sum[6])
+{
+    double angular[3], linear[3], further[3];
+    cross(m, s, angular);
+    cross(m, s + 3, linear);
+    cross(m + 3, s, further);
+    for (int k = 0; k < 3; k++) {
+        sum[k] += factor * angular[k];
+        sum[3 + k] += factor * (linear[k] + further[k]);
+    }
+}
+
+/* sum += a × b. */
+static void add_cross(const double a[3], const double b[3], double sum[3])
+{
+    double product[3];
+    cross(a, b, product);
+    for (int k = 0; k < 3; k++)
+        sum[k] += product[k];
+}
+
+#if N_ROWS > N_AXES
+/* Change of the rotation error e while the frame rotates by s: −(s + e × s/2 + c e × (e × s)),
+   c = (1 − θ/2 cot θ/2)/θ² for the angle θ = |e|.
+   Source: Chirikjian, "Stochastic Models, Information Theory, and Lie Groups", vol. 2, 2011, section 10.6. */
+static void error_slope(const double e[3], const double s[3], double slope[3])
+{
+    const double square = e[0] * e[0] + e[1] * e[1] + e[2] * e[2], half = 0.5 * sqrt(square), x = half * half;
+    const double c = half < 0.1 ? 1.0 / 12.0 + x * (1.0 / 180.0 + x * (1.0 / 1890.0 + x / 18900.0))
+                                : (1.0 - half * cos(half) / sin(half)) / square;
+    double once[3], twice[3];
+    cross(e, s, once);
+    cross(e, once, twice);
+    for (int k = 0; k < 3; k++)
+        slope[k] = -(s[k] + 0.5 * once[k] + c * twice[k]);
+}
+#endif
+
+/* Velocity and acceleration of the end body. */
+static void move_end(const double v[N_JOINTS], const double a[N_JOINTS], const JointMotion motion[N_BODIES],
+                     double velocity[6], double acceleration[6])
+{
+    for (int i = END_BODY; i >= 0; i = PARENT[i])
+        for (int k = 0; k < 6; k++) {
+            const double rate = RATIO[i] * v[LEADER[i]];
+            velocity[k] += motion[i].s[k] * rate;
+            acceleration[k] += motion[i].psi[k] * rate + motion[i].s[k] * RATIO[i] * a[LEADER[i]];
+        }
+}
+
+/* Add the rows of δw − δẍ for a body's joint. */
+static void add_rows(const double value[N_VARIABLES], TaskFrame *task, const JointMotion *motion,
+                     const double velocity[6], const double acceleration[6], int i, TaskSlopes *slopes)
+{
+    const double *s = motion->s, *omega = velocity;
+    double moved[6], by_q[6], by_v[6];
+    memcpy(moved, motion->psi, sizeof moved); /* ∂ of the velocity */
+    memcpy(by_q, motion->chi, sizeof by_q);   /* ∂ of the acceleration */
+    add_motion_cross(velocity, s, -1.0, moved);
+    add_motion_cross(velocity, motion->psi, -1.0, by_q);
+    add_motion_cross(acceleration, s, -1.0, by_q);
+    for (int k = 0; k < 6; k++)
+        by_v[k] = motion->psi[k] + moved[k];
+    add_cross(omega, s + 3, moved + 3); /* from the body at a point of the root to the task frame */
+    add_cross(acceleration, s + 3, by_q + 3);
+    add_cross(moved, velocity + 3, by_q + 3);
+    add_cross(omega, moved + 3, by_q + 3);
+    add_cross(s, velocity + 3, by_v + 3);
+    add_cross(omega, s + 3, by_v + 3);
+    for (int r = 0; r < N_AXES; r++) {
+        const int k = 3 + AXIS[r];
+        const double Kd = value[KD + r];
+        slopes->by_q[r][LEADER[i]] -= RATIO[i] * (Kd * moved[k] + value[KP + r] * s[k] + by_q[k]);
+        slopes->by_v[r][LEADER[i]] -= RATIO[i] * (Kd * s[k] + by_v[k]);
+    }
+#if N_ROWS > N_AXES
+    double error[3], turned[3];
+    rotation_error(&value[QUAT_DES], task->R, error);
+    error_slope(error, s, turned);
+    for (int k = 0; k < 3; k++) {
+        const double Kd = value[KD_ROT + k];
+        slopes->by_q[N_AXES + k][LEADER[i]] -= RATIO[i] * (Kd * moved[k] - value[KP_ROT + k] * turned[k] + by_q[k]);
+        slopes->by_v[N_AXES + k][LEADER[i]] -= RATIO[i] * (Kd * s[k] + by_v[k]);
+    }
+#else
+    (void)task;
+#endif
+}
+
+/* Add δJᵀ y by q: joint j turns the columns of J of the joints i after it, and moves the task frame for those before
+   it. y has angular and linear components in the root's axes. */
+static void add_turned(const JointMotion motion[N_BODIES], const double y[6], TaskSlopes *slopes)
+{
+    for (int i = END_BODY; i >= 0; i = PARENT[i])
+        for (int j = i; j >= 0; j = PARENT[j]) {
+            double linear[3], angular[3];
+            cross(motion[j].s, motion[i].s + 3, linear);
+            cross(motion[j].s, motion[i].s, angular);
+            const double both = y[3] * linear[0] + y[4] * linear[1] + y[5] * linear[2];
+            const double turn = y[0] * angular[0] + y[1] * angular[1] + y[2] * angular[2];
+            const double ratio = RATIO[i] * RATIO[j];
+            slopes->turned[LEADER[i]][LEADER[j]] += ratio * (both + turn);
+            if (i != j)
+                slopes->turned[LEADER[j]][LEADER[i]] += ratio * both;
+        }
+}
+
+/* J⁺ and y = J⁺ᵀ (q̈_cmd + Kn v), with the components of y in the root's axes. */
+static void invert(const double value[N_VARIABLES], const TaskFrame *task, const double given[N_JOINTS],
+                   double inverse[N_JOINTS][N_ROWS], double y[6])
+{
+    for (int r = 0; r < N_ROWS; r++) {
+        double J[N_ROWS][N_JOINTS], unit[N_ROWS] = {0}, column[N_JOINTS], sum = 0.0;
+        memcpy(J, task->J, sizeof J);
+        unit[r] = 1.0;
+        apply_pseudo_inverse(J, unit, value[RCOND], N_ROWS, column, NULL);
+        for (int i = 0; i < N_JOINTS; i++) {
+            inverse[i][r] = column[i];
+            sum += column[i] * (given[i] + value[KN] * value[V + i]);
+        }
+        y[r < N_AXES ? 3 + AXIS[r] : r - N_AXES] = sum;
+    }
+}
+
+static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                                 const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
+                                 double slope[N_JOINTS][X])
+{
+    const double Kn = value[KN];
+    double inverse[N_JOINTS][N_ROWS], y[6] = {0}, velocity[6] = {0};
+    double acceleration[6] = {0.0, 0.0, 0.0, -value[GRAVITY], -value[GRAVITY + 1], -value[GRAVITY + 2]};
+    TaskFrame task;
+    TaskSlopes slopes;
+    if (rank < N_ROWS)
+        return 0;
+    memset(&slopes, 0, sizeof slopes);
+    task_frame(joint, &value[V], &task);
+    invert(value, &task, given, inverse, y);
+    move_end(&value[V], given, motion, velocity, acceleration);
+    for (int i = END_BODY; i >= 0; i = PARENT[i])
+        add_rows(value, &task, &motion[i], velocity, acceleration, i, &slopes);
+    add_turned(motion, y, &slopes);
+    for (int r = 0; r < N_ROWS; r++)
+        for (int c = 0; c < N_JOINTS; c++)
+            for (int k = 0; k < N_JOINTS; k++) {
+                slopes.by_q[r][c] -= task.J[r][k] * slopes.turned[k][c];
+                slopes.by_v[r][c] += k == c ? Kn * task.J[r][k] : 0.0;
+            }
+    for (int i = 0; i < N_JOINTS; i++) {
+        for (int c = 0; c < N_JOINTS; c++) {
+            slope[i][Q + c] += slopes.turned[i][c];
+            for (int r = 0; r < N_ROWS; r++) {
+                slope[i][Q + c] += inverse[i][r] * slopes.by_q[r][c];
+                slope[i][V + c] += inverse[i][r] * slopes.by_v[r][c];
+            }
+        }
+        slope[i][V + i] -= Kn;
+    }
+    return 1;
+}
