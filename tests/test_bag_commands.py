@@ -10,7 +10,9 @@ from bags import STORE, header, joint_message, write_third_party
 from rosbags.rosbag2 import StoragePlugin
 
 import twodof
+from twodof.bag import recorded_commands
 from twodof.cli.main import main
+from twodof.errors import InputError
 from twodof.ros.messages import POINT
 
 BEGIN = 1_700_000_000_000_000_000
@@ -106,6 +108,13 @@ def test_points(native_path, tmp_path):
         (0.0, {"x_des[1]": 0.1, "x_des[2]": 0.2}),
         (0.01, {"x_des[1]": 0.2, "x_des[2]": 0.1}),
     ]
+
+
+def test_commands_in_memory_are_bounded(native_path, tmp_path, monkeypatch):
+    bag = write_third_party(tmp_path / "bag", [("/goal", BEGIN + i, point(0, 0.1, 0.2)) for i in range(10)])
+    monkeypatch.setattr(recorded_commands, "MAX_COMMANDS_SIZE", 1000)
+    with pytest.raises(InputError, match="more than 1000000 messages or 0 MiB of them on /goal"):
+        twodof.read_commands(native_path, bag)
 
 
 @pytest.mark.parametrize(

@@ -156,9 +156,15 @@ def test_refusal_names_the_mesh_and_where_it_may_be(disk, uri, mesh_dir):
     assert f"'{disk / (mesh_dir or 'ws/arm_description')}'" in str(refusal.value)
 
 
-def test_too_long_a_name_is_refused(disk):
+@pytest.mark.parametrize("name", ["a" * 5000, "a/" * 1000])
+def test_too_long_a_name_is_refused(name, disk):
     with pytest.raises(BuildError, match=r"cannot be read: .*too long"):
-        collect(disk, "package://arm/" + "a" * 5000, "ws")
+        collect(disk, f"package://arm/{name}", "ws")
+
+
+def test_too_many_names_are_refused(disk):
+    with pytest.raises(BuildError, match="more than 5000 different meshes"):
+        collect_meshes(urdf(*map(str, range(6000))), disk, None)
 
 
 @pytest.mark.parametrize("uri", ["../meshes/base.stl", PACKAGE])
@@ -253,12 +259,28 @@ LIBRARY = {
 @pytest.mark.parametrize(("name", "content"), LIBRARY.values(), ids=LIBRARY)
 def test_an_obj_brings_the_library_of_its_colours(disk, name, content):
     folder = disk / "ws/arm_description/meshes"
-    (folder / "box.obj").write_text(f"# a box\r\nmtllib {name}\r\nv 0 0 0\r\n")
+    (folder / "box.obj").write_text(f"# a box\r\nmtllib {name}\r\nmtllib {name}\r\nv 0 0 0\r\n")
     if content:
         (folder / name).write_bytes(content)
     _, files = collect_meshes(urdf("../meshes/box.obj"), disk / "ws/arm_description/urdf", None)
     libraries = {key: value.strip() for key, value in files.items() if key.endswith(".mtl")}
     assert libraries == ({"meshes/box.obj.mtl": content.strip()} if content else {})
+
+
+HOSTILE_LIBRARIES = {
+    "many": ("".join(f"mtllib {i}.mtl\n" for i in range(101)), "more than 100 material libraries"),
+    "large": ("mtllib a.mtl\nmtllib ./a.mtl\n", "File too large"),
+}
+
+
+@pytest.mark.parametrize(("text", "reason"), HOSTILE_LIBRARIES.values(), ids=HOSTILE_LIBRARIES)
+def test_libraries_are_bounded(text, reason, disk):
+    folder = disk / "ws/arm_description/meshes"
+    (folder / "box.obj").write_text(text)
+    with (folder / "a.mtl").open("wb") as library:
+        library.truncate(200 * 1024**2)
+    with pytest.raises(BuildError, match=f"box.obj.* cannot be read: .*{reason}"):
+        collect_meshes(urdf("../meshes/box.obj"), disk / "ws/arm_description/urdf", None)
 
 
 def test_a_library_outside_of_the_folders_is_refused(disk):

@@ -34,10 +34,12 @@ from bags import (
 )
 
 import twodof
+from twodof.bag import reader
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.records import DamageError, ReadBudget
 from twodof.cli.main import main
+from twodof.errors import BagError
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TOPIC = HEADER + SCHEMA + CHANNEL
@@ -239,6 +241,25 @@ def test_memory_is_that_of_the_numbers(bag, read):
     tracemalloc.stop()
     numbers = 8 * n * (1 + 2 + 2) if read is read_bag else 0  # stamps, positions, velocities
     assert peak < 1.2 * numbers + 5 * 1024**2
+
+
+def test_large_records_outside_chunks_are_read_one_after_another(bag):
+    (bag / "bag.mcap").write_bytes(TOPIC + channel(2, "/x") + message(bytes(4 * 1024**2), number=2) * 40 + FOOTER)
+    tracemalloc.start()
+    assert sum(len(stamps) for _, stamps, _ in read_messages(bag / "bag.mcap", ReadBudget())) == 40
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 80 * 1024**2
+
+
+def test_joint_states_in_memory_are_bounded(bag, monkeypatch):
+    (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) * 60_000 + FOOTER)
+    monkeypatch.setattr(reader, "MAX_DRAWN", 100_000)
+    drawn = reader.read_downsampled(bag, 60_000, lambda part: [])
+    assert drawn.count == 60_000 and 0 < len(drawn.t) < 1000
+    monkeypatch.setattr(reader, "MAX_SAMPLES", 1024**2)
+    with pytest.raises(BagError, match="more than 1 MiB of joint states"):
+        read_bag(bag)
 
 
 # --- provenance ---

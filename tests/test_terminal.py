@@ -9,6 +9,7 @@ import pytest
 from harness import forged
 
 import twodof
+from twodof.files import data_file
 
 TWODOF = [sys.executable, "-m", "twodof"]
 ESCAPES = "\x1b[31mred\x1b[0m‮reversed⁦"
@@ -90,6 +91,14 @@ def test_names_do_not_control_the_terminal(native_path, tmp_path):
         text = done.stdout + done.stderr
         assert "\\x1b[31mred" in text and "\\u202e" in text
         assert all(c.isprintable() or c == "\n" for c in text)
+
+
+def test_a_long_name_makes_no_long_warning(tmp_path):
+    name = "/".join(["a" * 200] * 20)
+    text = data_file("urdf", "2dof.urdf").read_text("utf-8")
+    (tmp_path / "a.urdf").write_text(text.replace("</robot>", f'<mesh filename="{name}"/></robot>'))
+    *_, line = run("build", "a.urdf", cwd=tmp_path).stderr.splitlines()
+    assert name[:100] in line and len(line) < 2200
 
 
 def test_a_line_break_in_a_name_makes_no_line(native_path, tmp_path):

@@ -39,6 +39,8 @@ MAX_COMPILER_TEXT = 1 * MIB  # its messages
 
 # meshes of one robot
 MAX_MESHES = 256 * MIB  # all files together
+MAX_PATH = 4096  # characters of a file's name
+MAX_LIBRARIES = 100  # of materials of an OBJ file
 MAX_TRIANGLES = 2_000_000  # in one picture; a Panda has 135,000
 MAX_SURFACES = 10_000  # in one picture, each of one colour
 MAX_MESH_MEMORY = 1024 * MIB  # address space of a reader
@@ -52,6 +54,7 @@ MAX_TABLE = 64 * MIB  # a CSV file
 MAX_CELLS = 1_000_000  # all cells are stored in the bag's run.json
 MAX_COMMANDS = 1_000_000  # messages of a bag
 MAX_COMMAND = 64 * KIB  # a message; some thousand joints, read within milliseconds
+MAX_COMMANDS_SIZE = 384 * MIB  # all of these messages, and what they take in memory
 MAX_TRAJECTORY = 4 * MIB  # a message; some ten thousand points, read within a second
 
 # bags
@@ -62,6 +65,10 @@ MAX_SUMMARY = 64 * MIB
 MAX_METADATA = 64 * MIB
 MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much memory
 MAX_HELD = 5_000_000  # input values, summed over all changes of inputs
+MAX_JOINT_STATE = 64 * KIB  # a message; a thousand joints
+MAX_SAMPLES = 2048 * MIB  # joint states in memory; a day of 7 joints at 100 Hz takes 1450 MiB
+MAX_DRAWN = 256 * MIB  # joint states in memory from which samples to draw are chosen
+MAX_LOOSE = 16 * MIB  # records outside chunks that are read at a time, apart from one large record
 MAX_VALUE = 1e100  # of a sample that is judged, fitted or drawn: squares of much larger numbers overflow
 MAX_PROFILES = 64 * KIB  # different QoS profiles of all topics, in YAML, which is slow to parse
 MAX_DEFINITION = 64 * KIB  # a message type

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from .reader import read_bag, whole_bag
 from .recording import Array, Recording
 from .recovery import copy_messages
 
+PART = 10_000  # rows of a CSV file that are written at a time
 ENDINGS = (".csv", ".parquet", ".mcap", ".lerobot")
 
 
@@ -51,10 +53,10 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     if len(bags) > 1:
         raise BagError(f"'{path}' has one bag; several become the episodes of a folder that ends in .lerobot")
     if path.suffix == ".mcap":
-        content: bytes | Iterable[bytes] = _mcap(bags[0])
+        content: Iterable[bytes] = _mcap(bags[0])
     else:
         columns = _columns(read_bag(bags[0]))
-        content = _csv(columns) if path.suffix == ".csv" else _parquet(columns)
+        content = _csv(columns) if path.suffix == ".csv" else [_parquet(columns)]
     with refusing(BagError, f"write '{path}'"):
         write_file(path, content)
     return path
@@ -77,12 +79,15 @@ def _columns(run: Recording) -> dict[str, tuple[str, Array]]:
     return columns
 
 
-def _csv(columns: dict[str, tuple[str, Array]]) -> bytes:
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(f"{name} [{unit}]" if unit else name for name, (unit, _) in columns.items())
-    writer.writerows(np.column_stack([values for _, values in columns.values()]).tolist())  # the shortest exact text
-    return file.getvalue().encode()
+def _csv(columns: dict[str, tuple[str, Array]]) -> Iterator[bytes]:
+    rows: Iterable[Sequence[object]] = [[f"{name} [{unit}]" if unit else name for name, (unit, _) in columns.items()]]
+    for k in count(0, PART):
+        file = io.StringIO()
+        csv.writer(file, lineterminator="\n").writerows(rows)
+        yield file.getvalue().encode()
+        rows = np.column_stack([values[k : k + PART] for _, values in columns.values()]).tolist()  # shortest exact text
+        if not rows:
+            return
 
 
 def _parquet(columns: dict[str, tuple[str, Array]]) -> bytes:

@@ -13,7 +13,7 @@ from zlib import crc32
 import lz4.frame
 import numpy as np
 
-from ..bounds import MAX_CHUNK, MAX_PROVENANCE, MAX_RATIO, MAX_TOPICS
+from ..bounds import MAX_CHUNK, MAX_LOOSE, MAX_PROVENANCE, MAX_RATIO, MAX_TOPICS
 from ..ros.cdr import Rows
 from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, refusing_damage
 
@@ -41,13 +41,15 @@ def mcap_messages(path: Path, budget: ReadBudget) -> Iterator[Batch]:
 def _chunks(path: Path, budget: ReadBudget) -> Iterator[bytes]:
     """Yield the records of each chunk, and groups of records outside chunks."""
     loose: list[bytes] = []
+    size = 0
     try:
         for opcode, content in _records(path, budget):
             budget.left += MAX_RATIO * len(content)
             if opcode != CHUNK:
                 loose.append(content)
-            if opcode == CHUNK or len(loose) > MANY:
-                before, loose = b"".join(loose), []
+                size += len(content)
+            if opcode == CHUNK or len(loose) > MANY or size > MAX_LOOSE:
+                before, loose, size = b"".join(loose), [], 0
                 yield before
             if opcode == CHUNK:
                 yield unpack_chunk(path, content, budget)

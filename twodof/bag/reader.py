@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_SAMPLES, MIB
 from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
@@ -24,7 +25,6 @@ from .recording import Array, ReceivedTargets, Recording, TopicCount
 from .records import DamageError, ReadBudget, Stamps
 from .summary import read_summary
 
-MAX_JOINT_STATE = 1024**2  # bytes; some ten thousand joints
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 LOG = logging.getLogger(__name__)
@@ -137,9 +137,11 @@ def _read(
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamps, messages)
-                        if downsampler is not None and len(states) > downsampler.most:
-                            thin(downsampler)
-                            thinned = True
+                        if downsampler is not None:
+                            downsampler.most = min(downsampler.most, MAX_DRAWN * len(states) // states.size)
+                            if len(states) > downsampler.most:
+                                thin(downsampler)
+                                thinned = True
                 elif targets and channel.topic == prefix + TARGET and channel.type in (POINT, POSE):
                     targets.add(stamps, messages)
         _check_count(folder, total)
@@ -215,9 +217,17 @@ class _JointStates:
         self._stamps.frombytes(stamps.tobytes())
         for stored, part in zip(self._numbers, numbers, strict=True):
             stored.frombytes(part.tobytes())
+        if self.size > MAX_SAMPLES:
+            most = f"{MAX_SAMPLES // MIB} MiB"
+            raise BagError(f"'{self._path}' has more than {most} of joint states; cut it into several bags")
 
     def __len__(self) -> int:
         return len(self._stamps)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all states."""
+        return 8 * (len(self._stamps) + sum(map(len, self._numbers)))
 
     def keep(self, chosen: Indices) -> None:
         """Keep only the states at these indices of the arrays that ``arrays`` returns."""

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..bounds import MAX_COMMANDS
+from ..bounds import MAX_COMMANDS, MAX_COMMANDS_SIZE, MIB
 from ..errors import BagError, InputError
 from ..files import shown
 from ..fmu import Fmu, load_fmu
@@ -27,6 +27,7 @@ from .reader import whole_bag
 from .records import DamageError, ReadBudget
 
 LOG = logging.getLogger(__name__)
+COMMAND_SIZE = 150  # bytes that a message takes in memory in addition to its own
 SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of a robot's motion, not of commands
 FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs that trajectories set
 Read = TypeVar("Read", Command, Trajectory)
@@ -70,12 +71,13 @@ def read_commands(
         return [(-inf, resolve(fmu, _inputs(fmu, provenance["start_values"]))), *changes]
     follows = Commands(fmu)
     types = (*follows.types, *[JOINT_TRAJECTORY] * all(map(fmu.vector, (*FOLLOWING, "q_start"))))
-    topics, begins = _messages(path, types, topic)
+    topics, begins, size = _messages(path, types, topic)
     chosen = _only(topics, path, topic, types)
+    if len(topics[chosen]) > MAX_COMMANDS or size > MAX_COMMANDS_SIZE:
+        most = f"{MAX_COMMANDS} messages or {MAX_COMMANDS_SIZE // MIB} MiB of them"
+        raise InputError(f"'{path}' has more than {most} on {shown(chosen)}")
     commands = sorted(topics[chosen], key=lambda command: command[0])
     begin = min((t for name, t in begins.items() if name != chosen), default=commands[0][0])
-    if len(commands) > MAX_COMMANDS:
-        raise InputError(f"'{path}' has more than {MAX_COMMANDS} messages on {shown(chosen)}")
     if len({kind == JOINT_TRAJECTORY for _, kind, _ in commands}) > 1:
         raise InputError(f"'{path}' has trajectories and other commands on {shown(chosen)}")
     if commands[0][1] == JOINT_TRAJECTORY:
@@ -85,9 +87,12 @@ def read_commands(
     return [((came - begin) / NANOSECONDS, dict(command.inputs)) for came, command in read]
 
 
-def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict[str, Stored], dict[str, int]]:
-    """Return the messages that may be commands by topic, and the first time of each topic of joint states."""
-    topics: dict[str, Stored] = {}
+def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict[str, Stored], dict[str, int], int]:
+    """Return the messages that may be commands by topic, the first time of each topic of joint states, and a size.
+
+    The size is that of the messages in memory. Those beyond MAX_COMMANDS_SIZE are left out.
+    """
+    size, topics = 0, dict[str, Stored]()
     begins: dict[str, int] = {}
     try:
         files, budget = whole_bag(path), ReadBudget()
@@ -98,11 +103,13 @@ def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict
                 begins[channel.topic] = min(first, begins.get(channel.topic, first))
             wanted = channel.topic not in SAMPLES if topic is None else channel.topic == topic
             if channel.type in types and wanted:
-                rows = zip(stamps.tolist(), repeat(channel.type), map(np.ndarray.tobytes, data))
-                topics.setdefault(channel.topic, []).extend(rows)
+                stored = topics.setdefault(channel.topic, [])
+                size += data.nbytes + COMMAND_SIZE * len(data)
+                if size <= MAX_COMMANDS_SIZE:
+                    stored.extend(zip(stamps.tolist(), repeat(channel.type), map(np.ndarray.tobytes, data)))
     except (OSError, DamageError) as error:
         raise BagError(f"cannot read the bag '{path}': {error}") from error
-    return topics, begins
+    return topics, begins, size
 
 
 def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:

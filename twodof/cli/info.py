@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..simulation.verdict import Verdict
 
 
-MOST_JUDGED = 200_000  # samples of a bag without a stored verdict, which takes a second to judge
+MOST_JUDGED = 200_000  # samples, of up to 10 joints, of a bag without a stored verdict, which takes a second to judge
 
 
 def add(info: Parser) -> None:
@@ -246,7 +246,8 @@ def _verdict_of(run: Recording) -> Verdict | None:
     from ..bag.reader import read_bag
 
     stored = run.stored_verdict
-    return read_bag(run.path).verdict if stored is None and run.count <= MOST_JUDGED else stored
+    few = run.count * max(10, len(run.joints)) <= 10 * MOST_JUDGED
+    return read_bag(run.path).verdict if stored is None and few else stored
 
 
 def _state(run: Recording, k: int) -> str:

@@ -58,7 +58,7 @@ class _Words(logging.Formatter):
     """Log formatter that replaces arguments by options in messages of the library."""
 
     def format(self, record: logging.LogRecord) -> str:
-        line = in_options(super().format(record))
+        line = _shortened(in_options(super().format(record)))
         return f"{CLEAR}{line}" if sys.stderr.isatty() else line  # overwrites a progress line
 
 
@@ -131,11 +131,14 @@ def _facts_beside(output: str | None) -> AbstractContextManager[object]:
 
 
 def _fail(message: str, status: int = 1) -> int:
-    line = " ".join(message.split())
-    if len(line) > LONGEST_LINE:  # names in untrusted files can have any length
-        line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
-    say(f"twodof: error: {line}", error=True)
+    say(f"twodof: error: {_shortened(' '.join(message.split()))}", error=True)
     return status
+
+
+def _shortened(line: str) -> str:
+    """Return a message without its middle if it is long: names in untrusted files can have any length."""
+    half = LONGEST_LINE // 2
+    return line if len(line) <= LONGEST_LINE else f"{line[:half]} … {line[-half:]}"
 
 
 def _silence() -> None:

@@ -8,9 +8,10 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from ..bounds import MAX_MESHES
+from ..bounds import MAX_FOLDERS_DEEP, MAX_LIBRARIES, MAX_MESHES, MAX_PATH
 from ..errors import BuildError
 from ..files import read_file
+from ..plant.urdf import MAX_SHAPES
 
 MAX_LISTED = 50  # names listed in a message
 LOG = logging.getLogger(__name__)
@@ -30,17 +31,22 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
     missing: list[str] = []
+    room = MAX_MESHES
     for mesh in tree.iter("mesh"):
         uri = mesh.get("filename")
         if uri is None or uri in missing:
             continue
+        if len(names) + len(missing) > MAX_SHAPES:
+            raise BuildError(f"the URDF has more than {MAX_SHAPES} different meshes")
         if uri not in names:
             try:
                 path = _find(uri, folder, mesh_dir)
                 name = _inside(path, files)
-                files[name] = read_file(path, MAX_MESHES - sum(map(len, files.values())))
-                if colours := _colours(path, files[name], mesh_dir):
+                files[name] = read_file(path, room)
+                room -= len(files[name])
+                if colours := _colours(path, files[name], mesh_dir, room):
                     files[f"{name}.mtl"] = colours
+                    room -= len(colours)
                 names[uri] = name
             except FileNotFoundError:
                 missing.append(uri)
@@ -74,6 +80,8 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
     """Return the file of a mesh, links resolved, inside one of the allowed folders."""
     own, folders = folder.resolve(), mesh_folders(folder, mesh_dir)
     scheme, separator, rest = uri.partition("://")
+    if len(uri) > MAX_PATH or unquote(uri).count("/") > MAX_FOLDERS_DEEP:
+        raise ValueError(f"its name is too long, or has more than {MAX_FOLDERS_DEEP} folders")
     if not separator or scheme == "file":
         name = unquote(rest) if separator else uri
         candidates = [root / name for root in (own, mesh_dir) if root is not None]
@@ -85,9 +93,10 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
         most = min(2, len(parts)) if mesh_dir is None else len(parts)
         candidates = [root.joinpath(*parts[i:]) for root in roots for i in range(most)]
     for candidate in candidates:
-        path = candidate.resolve()
-        if any(path.is_relative_to(root) for root in folders) and path.is_file():
-            return path
+        if os.path.isfile(candidate):
+            path = candidate.resolve()
+            if any(path.is_relative_to(root) for root in folders):
+                return path
     if any(os.path.lexists(candidate) for candidate in candidates):
         where = " or ".join(f"'{root}'" for root in dict.fromkeys(folders))
         raise BuildError(
@@ -97,15 +106,20 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
     raise FileNotFoundError
 
 
-def _colours(path: Path, content: bytes, mesh_dir: Path | None) -> bytes:
-    """Return the existing material libraries of an OBJ file."""
-    libraries = b""
+def _colours(path: Path, content: bytes, mesh_dir: Path | None, most: int) -> bytes:
+    """Return the existing material libraries of an OBJ file, each once, of at most ``most`` bytes together."""
+    libraries, names = b"", set[bytes]()
     if path.suffix.lower() != ".obj":
         return libraries
-    for line in re.findall(rb"^mtllib[ \t]+([^\r\n]+)", content, re.MULTILINE):
+    for line in re.finditer(rb"^mtllib[ \t]+([^\r\n]+)", content, re.MULTILINE):
+        name = line[1].strip()
+        if name in names:
+            continue
+        names.add(name)
+        if len(names) > MAX_LIBRARIES:
+            raise ValueError(f"it has more than {MAX_LIBRARIES} material libraries")
         with suppress(FileNotFoundError):
-            library = _find(os.fsdecode(line.strip()), path.parent, mesh_dir)
-            libraries += read_file(library, MAX_MESHES) + b"\n"
+            libraries += read_file(_find(os.fsdecode(name), path.parent, mesh_dir), most - len(libraries)) + b"\n"
     return libraries
 
 
