@@ -116,6 +116,17 @@ def test_meshes_without_end_are_not_copied(linked):
     assert not (linked / "meshes").exists()
 
 
+def test_meshes_in_hundreds_of_nested_folders_are_refused(linked, monkeypatch):
+    (linked / "meshes").mkdir()
+    monkeypatch.chdir(linked / "meshes")
+    for _ in range(700):
+        os.mkdir("a")
+        os.chdir("a")
+    with pytest.raises(BagError, match=r"cannot recover the bag .*; nothing is lost"):
+        twodof.recover(linked)
+    assert {file.name for file in linked.parent.iterdir()} == {"bag", "private"}
+
+
 @pytest.mark.parametrize("name", ["%2E", "%2E%2E", "%2F", "a%2F%2E%2E"])
 def test_names_of_robots_are_no_paths(name, linked):
     (linked / "run.json").rename(linked / f"run.{name}.json")

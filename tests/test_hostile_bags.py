@@ -13,7 +13,20 @@ import mutations
 import numpy as np
 import pytest
 import zstandard
-from bags import CHANNEL, FOOTER, HEADER, SCHEMA, channel, chunk, joint_message, message, record, sample, serialised
+from bags import (
+    CHANNEL,
+    FOOTER,
+    HEADER,
+    SCHEMA,
+    channel,
+    chunk,
+    joint_message,
+    message,
+    record,
+    sample,
+    serialised,
+    texts,
+)
 from jail import MIB, SPECIAL, check_reading, without_slow
 from jail import jail as jail
 from jail import the_jail as the_jail
@@ -131,6 +144,7 @@ def hollow(size: int, content: bytes) -> Callable[[Path], None]:
     return with_mcap(make)
 
 
+FIELDS = "\n".join(f"float64 a{i}" for i in range(3000))
 ENDLESS = "WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r)"
 HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     **{
@@ -154,6 +168,14 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
             SCHEMA,
             *channels("- {depth: [" + "1," * 200 + "]}#"),
             *(message(bytes(4), number=i) for i in range(1, 1000)),
+        )
+    ),
+    "4 MB of types": with_mcap(
+        lambda: mcap_of(
+            SCHEMA,
+            *(record(3, struct.pack("<H", i), texts(f"a/msg/B{i}", "ros2msg", FIELDS)) for i in range(2, 100)),
+            *(record(4, struct.pack("<HH", i, i), texts(f"/t{i}", "cdr"), bytes(4)) for i in range(2, 100)),
+            *(message(bytes(4), number=i) for i in range(2, 100)),
         )
     ),
     "a message of 700 MB": with_mcap(lambda: mcap_of(SCHEMA, CHANNEL, message(bytes(700 * MIB)))),
@@ -206,4 +228,5 @@ SLOW = {
     "30 MB of provenance",
     "60 MB of provenance",
     "a thousand topics with profiles of their own",
+    "4 MB of types",
 }

@@ -337,9 +337,26 @@ def test_custom_data_leaves_out_changes_that_take_yaml_minutes(run, tmp_path):
         for k in range(20_000):
             inputs = {"x_des[1]": k / 7}
             bag.write(sample(run, k)._replace(inputs=inputs, since=(k - 1) / 100))
-    custom = json.loads(metadata(tmp_path / "bag")["custom_data"]["twodof"])
-    assert (custom["input_changes"], custom["inputs_known_until"]) == ([], 0.0)
-    assert len(twodof.read_bag(tmp_path / "bag").provenance["input_changes"]) == 20_000
+    for remake in (lambda: None, lambda: recovered(tmp_path / "bag")):
+        remake()
+        custom = json.loads(metadata(tmp_path / "bag")["custom_data"]["twodof"])
+        assert (custom["input_changes"], custom["inputs_known_until"]) == ([], 0.0)
+        assert len(twodof.read_bag(tmp_path / "bag").provenance["input_changes"]) == 20_000
+
+
+def recovered(bag):
+    (bag / "metadata.yaml").unlink()
+    return twodof.recover(bag)
+
+
+def test_a_robot_that_takes_yaml_minutes_is_left_out_of_custom_data(run, tmp_path):
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        bag.write(sample(run, 0))
+    file = tmp_path / "bag/run.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "urdf": " ' " * 2**20}))
+    recovered(tmp_path / "bag")
+    assert "twodof" not in (metadata(tmp_path / "bag")["custom_data"] or {})
+    assert len(twodof.read_bag(tmp_path / "bag").provenance["urdf"] or "") == 3 * 2**20
 
 
 def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run, tmp_path):

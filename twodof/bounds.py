@@ -72,6 +72,7 @@ MAX_LOOSE = 16 * MIB  # records outside chunks that are read at a time, apart fr
 MAX_VALUE = 1e100  # of a sample that is judged, fitted or drawn: squares of much larger numbers overflow
 MAX_PROFILES = 64 * KIB  # different QoS profiles of all topics, in YAML, which is slow to parse
 MAX_DEFINITION = 64 * KIB  # a message type
+MAX_DEFINITIONS = 256 * KIB  # message types without a hash; the hash of one of 64 KiB takes a second
 
 # sweeps
 MAX_RUNS = 1_000_000

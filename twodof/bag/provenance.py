@@ -133,6 +133,13 @@ class ProvenanceFile:
         return (b"]," if rest else b"]") + _as_json(rest)[1:] + b"\n"
 
 
+def for_metadata(text: bytes, provenance: Provenance) -> str:
+    """Return the text of a run.json for metadata.yaml, without the changes of inputs if it is long."""
+    if len(text) > MAX_YAML:
+        text = _as_json({**provenance, "input_changes": [], KNOWN_UNTIL: provenance["start_time"]})
+    return text.decode("utf-8").strip()
+
+
 def provenance_of(run: Experiment, command_line: str) -> Provenance:
     """Return a run's provenance without the changes of inputs."""
     fmu = run.fmu

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 from rosbags.interfaces import Connection, Qos
@@ -17,7 +16,7 @@ from rosbags.rosbag2 import Reader, ReaderError, WriterError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from ..bounds import MAX_DEFINITION, MAX_MESHES, MAX_PROFILES, MAX_PROVENANCE
+from ..bounds import MAX_DEFINITION, MAX_DEFINITIONS, MAX_MESHES, MAX_PROFILES, MAX_PROVENANCE
 from ..errors import BagError, no_such
 from ..files import lock, read_file, sync
 from . import provenance
@@ -81,7 +80,7 @@ def recover(path: str | Path) -> Recovered:
             sync(folder.parent)
     except BlockingIOError as error:
         raise BagError(f"the bag '{bag}' is still being written, or recovered") from error
-    except (OSError, sqlite3.Error, WriterError) as error:
+    except (OSError, sqlite3.Error, WriterError, RecursionError) as error:  # RecursionError: of nested folders
         reason = getattr(error, "strerror", None) or str(error)
         raise BagError(f"cannot recover the bag '{bag}': {reason}; nothing is lost") from error
     return Recovered(bag, original, counts, damage)
@@ -140,14 +139,17 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
     others = set()
     writer = BagWriter(new, storage)
     kept: dict[str, bytes] = {}
+    room = 4 * provenance.MAX_YAML
     for robot in robots:
         name = provenance.file_of(robot)
         with suppress(OSError):
             kept[name] = read_file(folder / name, MAX_PROVENANCE, follow=False)
         with suppress(BagError):  # save the messages without a damaged provenance
-            if provenance.read_provenance(folder, robot):
-                text = kept[name].decode("utf-8").strip()
-                writer.set_custom_data(provenance.key_of(robot), text)
+            if known := provenance.read_provenance(folder, robot):
+                text = provenance.for_metadata(kept[name], known)
+                room -= len(text)
+                if room >= 0:
+                    writer.set_custom_data(provenance.key_of(robot), text)
     with writer:
         topics, pending = _Topics(writer), 0
         for file in files:
@@ -196,7 +198,8 @@ class _Topics:
         self._writer = writer
         self._connections: dict[Channel, Connection] = {}
         self._profiles: dict[str, list[Qos]] = {}
-        self._yaml = 0
+        self._hashes: dict[tuple[str, str], str] = {}
+        self._yaml = self._defined = 0
 
     def connection(self, channel: Channel) -> Connection:
         if channel not in self._connections:
@@ -204,7 +207,7 @@ class _Topics:
                 channel.topic,
                 channel.type,
                 msgdef=channel.definition,
-                rihs01=channel.hash or _hash(channel.type, channel.definition),
+                rihs01=channel.hash or self._hash(channel),
                 serialization_format=channel.serialization,
                 offered_qos_profiles=self._qos(channel.qos),
             )
@@ -220,10 +223,16 @@ class _Topics:
                     self._profiles[text] = parse_qos(text)
         return self._profiles[text]
 
+    def _hash(self, channel: Channel) -> str:
+        """Return ROS 2's hash of a type, computed from the definition in the file."""
+        key = channel.type, channel.definition
+        if key not in self._hashes:
+            self._defined += len(channel.definition)
+            self._hashes[key] = _computed_hash(*key) if self._defined < MAX_DEFINITIONS else NO_HASH
+        return self._hashes[key]
 
-@cache
-def _hash(kind: str, definition: str) -> str:
-    """Return ROS 2's hash of a type, computed from the definition in the file."""
+
+def _computed_hash(kind: str, definition: str) -> str:
     if len(definition) > MAX_DEFINITION:
         return NO_HASH
     store = get_typestore(Stores.EMPTY)
