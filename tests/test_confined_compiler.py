@@ -45,6 +45,11 @@ def test_no_other_file_is_read(tmp_path: Path, attack: object) -> None:
         compile_web_module({"page.c": attack(secret).encode()}, ["page.c"])
 
 
+def test_a_module_is_not_larger_than_a_page_holds() -> None:
+    with pytest.raises(BuildError, match="the compiler failed"):
+        compile_web_module({"page.c": b"__attribute__((used)) char a[100000000] = {1};"}, ["page.c"])
+
+
 def zigs(folder: Path) -> set[str]:
     """Return the processes of zig that have a cache in the folder."""
     found = set()

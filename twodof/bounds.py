@@ -35,6 +35,7 @@ MAX_XACRO_WAIT = 60  # s by the clock
 MAX_COMPILER_MEMORY = 4096 * MIB  # address space of one process; tiago_dual takes 0.3 GiB of memory
 MAX_COMPILER_SECONDS = 300  # of one process; tiago_dual takes 9
 MAX_COMPILER_WAIT = 600  # s of wall time
+MAX_COMPILER_FILE = 64 * MIB  # a file that it writes; the module of tiago_dual has 2
 MAX_COMPILER_TEXT = 1 * MIB  # its messages
 
 # meshes of one robot

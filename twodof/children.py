@@ -197,16 +197,17 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
         _allow_calls(libc)
 
 
-def confine_program(memory: int, seconds: int, program: Path, folders: Sequence[Path]) -> None:
+def confine_program(memory: int, seconds: int, file: int, program: Path, folders: Sequence[Path]) -> None:
     """Confine this process, which then starts a program, and the program irrevocably.
 
     Args:
         memory: largest address space of each process, bytes.
         seconds: processor time of each process since its start.
+        file: largest size of a file that it writes, bytes.
         program: folder of the program and its files, which it may read and execute on kernels with Landlock.
         folders: the only other folders in which it may read and write there.
     """
-    limit(memory, {resource.RLIMIT_CPU: seconds})
+    limit(memory, {resource.RLIMIT_CPU: seconds, resource.RLIMIT_FSIZE: file})
     _allow_files({program: READ | EXECUTE, **dict.fromkeys(folders, ~EXECUTE)})
 
 

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from ..bounds import MAX_COMPILER_MEMORY, MAX_COMPILER_SECONDS, MAX_COMPILER_TEXT, MAX_COMPILER_WAIT
+from ..bounds import MAX_COMPILER_FILE, MAX_COMPILER_MEMORY, MAX_COMPILER_SECONDS, MAX_COMPILER_TEXT, MAX_COMPILER_WAIT
 from ..children import Child, confine_program
 from ..errors import BuildError
 from ..files import data_file, temporary_folder, write_file
@@ -273,7 +273,7 @@ def _run_confined(command: Sequence[str], folder: Path, environment: Mapping[str
 
 
 def _compile_in_child(pipe: Connection, command: Sequence[str], home: Path, folders: Sequence[Path]) -> None:
-    confine_program(MAX_COMPILER_MEMORY, MAX_COMPILER_SECONDS, home, folders)
+    confine_program(MAX_COMPILER_MEMORY, MAX_COMPILER_SECONDS, MAX_COMPILER_FILE, home, folders)
     done = subprocess.run(command, cwd=folders[0], capture_output=True, text=True, errors="replace", check=False)
     pipe.send_bytes(json.dumps([done.returncode, done.stderr.strip()[-MAX_COMPILER_TEXT // 8 :]]).encode())
 
