@@ -192,6 +192,14 @@ def described(table: pa.Table, key: str, value: object) -> pa.Table:
     return table.replace_schema_metadata({b"twodof": json.dumps(provenance)})
 
 
+def varying(table: pa.Table, count: int) -> pa.Table:
+    design = {"grids": {f"v{i}": [1.0] for i in range(count)}, "ranges": {}, "draws": 1, "seed": 0}
+    columns = [table.schema.field("Kp").with_name(f"v{i}") for i in range(count)]
+    fields = [table.schema.field(0), *columns, *[*table.schema][2:]]
+    made = described(pa.schema(fields, table.schema.metadata).empty_table(), "design", design)
+    return pa.Table.from_pylist([], made.schema)
+
+
 HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
     "without outcomes": lambda table: table.drop(["outcome"]),
     "without runs": lambda table: table.drop(["run"]),
@@ -204,6 +212,12 @@ HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
     "no design": lambda table: described(table, "design", []),
     "no FMU": lambda table: described(table, "fmu", {}),
     "a long number": lambda table: described(table, "options", {"stop_time": 10**400, "step": 1, "settings": {}}),
+    "values that are not in the grid": lambda table: changed(table, "Kp", pa.array([1.0, 1.5])),
+    "many varied variables": lambda table: varying(table, 301),
+    "many settings": lambda table: described(
+        table, "options", {"stop_time": 1, "step": 1, "settings": dict.fromkeys(map(str, range(10_001)), 1)}
+    ),
+    "a long provenance": lambda table: described(table, "command_line", "a" * 2**25),
     "endless": endless,
     "one text for all": of_one_text,
 }
@@ -227,7 +241,7 @@ def test_hostile_table_gets_one_line_in_little_memory(sound, tmp_path, make):
     usual = pa.default_memory_pool()
     pa.set_memory_pool(READING)
     try:
-        with pytest.raises(TwoDofError, match=r"runs\.parquet' was not written|it is damaged"):
+        with pytest.raises(TwoDofError, match=r"runs\.parquet' (was not written|has more than 300)|it is damaged"):
             read_sweep(tmp_path)
     finally:
         pa.set_memory_pool(usual)

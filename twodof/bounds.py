@@ -77,6 +77,8 @@ MAX_DEFINITIONS = 256 * KIB  # message types without a hash; the hash of one of 
 
 # sweeps
 MAX_RUNS = 1_000_000
+MAX_VARIED = 300  # varied variables; a figure of all takes 0.03 s for each
+MAX_SETTINGS = 10_000
 MAX_SWEEP = 512 * MIB  # the table in memory: a million runs, each with a message
 
 # figures and pages

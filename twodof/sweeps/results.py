@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_NUMBER, MAX_RUNS, MAX_SWEEP
+from ..bounds import MAX_NUMBER, MAX_PROVENANCE, MAX_RUNS, MAX_SETTINGS, MAX_SWEEP, MAX_VARIED
 from ..errors import SweepError, no_such
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
@@ -281,13 +281,14 @@ def _expanded(texts: pa.ChunkedArray) -> int:
 
 
 def _check_values(file: Path, table: pa.Table, count: int) -> None:
-    """Refuse runs outside the design, and invalid numbers."""
-    runs = table.column("run")
+    """Refuse runs and values outside the design, and invalid numbers."""
+    runs, grids = table.column("run"), _provenance(file, table.schema)["design"]["grids"]
     numbers = [column for column in table.columns if pa.types.is_float64(column.type)]
     if len(table) and not (
         len(runs.unique()) == len(runs)
         and 0 <= pc.min(runs).as_py() <= pc.max(runs).as_py() < count
         and all(pc.all(pc.less(pc.abs(column), MAX_NUMBER), min_count=0).as_py() for column in numbers)
+        and all(pc.all(pc.is_in(table.column(n), pa.array(grids[n], pa.float64()))).as_py() for n in grids)  # of a map
     ):
         raise _damaged(file)
 
@@ -298,9 +299,14 @@ def _damaged(file: Path) -> SweepError:
 
 def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
     try:
-        provenance: dict[str, Any] = parsed((schema.metadata or {})[KEY])
+        text = (schema.metadata or {})[KEY]
+        provenance: dict[str, Any] = parsed(text) if len(text) <= MAX_PROVENANCE else {}
         if not fits(provenance, SHAPE):
             raise ValueError
+        design = provenance["design"]
+        varied, settings = len(design["grids"]) + len(design["ranges"]), len(provenance["options"]["settings"])
+        if varied > MAX_VARIED or settings > MAX_SETTINGS:
+            raise SweepError(f"'{file}' has more than {MAX_VARIED} varied variables or {MAX_SETTINGS} settings")
     except (KeyError, ValueError, RecursionError):
         raise SweepError(f"'{file}' was not written by twodof") from None
     return provenance
