@@ -150,6 +150,10 @@ HOSTILE_FMUS: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: fmu_of(description(), ("modelDescription.xml", b"\3\0", 0, 0)),
         "two members 'modelDescription.xml'",
     ),
+    "two descriptions of other names": (
+        lambda: fmu_of(description(), (".//modelDescription.xml", b"\3\0", 0, 0)),
+        "two members 'modelDescription.xml'",
+    ),
     "no version": (lambda: fmu_of("<fmiModelDescription/>"), "it states no fmiVersion"),
     "900 folders deep": (lambda: fmu_of(description(), ("a/" * 900 + "b", b"\3\0", 0, 0)), "nested deeper"),
 }

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
@@ -100,13 +101,12 @@ def check_archive(path: str | Path | bytes) -> None:
     raw = io.BytesIO(path) if isinstance(path, bytes) else io.FileIO(path)
     with _Directory(raw) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
-    files = set[str]()
+    names = [PurePosixPath(member.filename) for member in members]  # ./a//b is a/b
     for member in members:
         _check_member(member)
-        if member.filename in files:  # readers differ in the member that they read
-            raise UnsafeArchiveError(f"it is unsafe: it has two members '{member.filename}'")
-        files.add(member.filename)
-    names = [PurePosixPath(member.filename) for member in members]
+    if len({*names}) < len(names):  # readers differ in the member that they read
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise UnsafeArchiveError(f"it is unsafe: it has two members '{twice}'")
     if len({*names, *(folder for name in names for folder in name.parents)}) > MAX_MEMBERS:
         raise UnsafeArchiveError(f"it has more than {MAX_MEMBERS} files and folders")
     if sum(member.file_size for member in members) > MAX_UNZIPPED:
