@@ -11,6 +11,8 @@ from PIL import Image
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import PlotError
+from twodof.plots.film import film
 
 GREY = (91, 101, 112)
 STOP, TARGETS = 3.0, ((-0.2, 0.05), (0.1, 0.2))
@@ -82,9 +84,9 @@ def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag, tmp_path, kind, 
 def test_a_picture_is_the_end_of_the_run(bag, tmp_path):
     for kind in ("png", "mp4"):
         assert main(["view", str(bag), "--export", str(tmp_path / f"run.{kind}")]) == 0
-    (picture,), film = frames(tmp_path / "run.png"), frames(tmp_path / "run.mp4")
+    (picture,), moving = frames(tmp_path / "run.png"), frames(tmp_path / "run.mp4")
     assert picture.shape == (720, 1280, 3)
-    off = [np.abs(picture.astype(int) - frame).mean() for frame in (film[0], film[-1])]
+    off = [np.abs(picture.astype(int) - frame).mean() for frame in (moving[0], moving[-1])]
     assert off[1] < 0.5 < off[0]
 
 
@@ -101,3 +103,16 @@ def test_reasons_against_a_film_are_reported(bag, tmp_path, capsys, monkeypatch)
         assert words in said and said.count("\n") == 1
     assert "install the extra 'video'" in said
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_film_that_ffmpeg_does_not_end_is_not_written(bag, tmp_path, monkeypatch):
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "/bin/false")
+    with pytest.raises(PlotError, match="FFmpeg failed, exit status 1; is there room in"):
+        film(bag, tmp_path / "a.gif")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_films_of_centuries_are_refused(bag, tmp_path, monkeypatch):
+    monkeypatch.setattr("twodof.plots.film.MAX_FRAMES", 10)
+    with pytest.raises(PlotError, match=r"a film has at most 0\.4 s"):
+        film(bag, tmp_path / "a.gif")

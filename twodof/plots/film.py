@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import io
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
 
 import numpy as np
 
 from ..bag.recording import Recording
+from ..bounds import MAX_FRAMES
 from ..errors import PlotError
 from ..export.closed_form import Array
-from ..files import refusing, write_file
+from ..files import refusing, temporary_folder, write_file
 from ..version import needing
 from .figure import Drawing, draw_head, drawn
 from .panels import title
 from .runs import draw_view
 from .settings import number
-from .strokes import GREY, Style, line_styles
+from .strokes import GREY, line_styles
 from .track import Track, read_tracks
 from .words import common_settings, outcome
 from .workspace import views
@@ -31,14 +33,13 @@ from matplotlib.image import imsave
 
 SIZE, DOTS = (8.0, 4.5), 160  # inches, and pixels per inch: 1280 × 720
 PALETTE = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"
-FILMS: dict[str, Style] = {
-    ".mp4": dict(
-        fps=30, codec="libx264", output_params=["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
-    ),
-    ".webp": dict(fps=30, codec="libwebp_anim", output_params=["-loop", "0", "-quality", "75"]),
-    ".gif": dict(fps=25, codec="gif", pix_fmt_out="pal8", output_params=["-filter_complex", PALETTE]),
+FILMS = {
+    ".mp4": (30, "libx264 -pix_fmt yuv420p -crf 23 -preset veryfast -movflags +faststart"),
+    ".webp": (30, "libwebp_anim -pix_fmt yuv420p -loop 0 -quality 75"),
+    ".gif": (25, f"gif -pix_fmt pal8 -filter_complex {PALETTE}"),
 }
-"""Options of FFmpeg by suffix; a frame of a GIF lasts a whole number of hundredths of a second."""
+"""Frames per second, and codec with options of FFmpeg, by suffix; a frame of a GIF lasts whole hundredths of a second.
+"""
 
 
 def film(
@@ -64,28 +65,30 @@ def film(
         for picture in _frames(track, np.array([end])):
             imsave(content, np.frombuffer(picture, np.uint8).reshape(shape), format="png")
     else:
-        form = FILMS[kind]
-        times = np.arange(round(end * form["fps"]) + 1) / form["fps"]
-        content.write(_encoded(_frames(track, times), path, kind))
+        fps, codec = FILMS[kind]
+        if end * fps > MAX_FRAMES:
+            raise PlotError(f"'{track.recording.path}' has {end:g} s; a film has at most {MAX_FRAMES / fps:g} s")
+        times = np.arange(round(end * fps) + 1) / fps
+        content.write(_encoded(_frames(track, times), path, ["-r", str(fps), "-i", "-", "-vcodec", *codec.split()]))
     with refusing(PlotError, f"write '{path}'"):
         write_file(path, content.getvalue())
 
 
-def _encoded(frames: Iterator[bytes], path: Path, kind: str) -> bytes:
-    """Return frames as a file's content, by FFmpeg."""
+def _encoded(frames: Iterator[bytes], path: Path, options: Sequence[str]) -> bytes:
+    """Return frames as a file's content, by FFmpeg; imageio's own writer hides that it failed."""
     with needing(PlotError, f"write '{path}'", "video"):
-        import imageio_ffmpeg
-    size = tuple(round(side * DOTS) for side in SIZE)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, f"film{kind}")
-        # FFmpeg's writer would round the size up to multiples of 16 pixels
-        writer = imageio_ffmpeg.write_frames(
-            file, size, pix_fmt_in="rgba", quality=None, macro_block_size=2, ffmpeg_log_level="error", **FILMS[kind]
-        )
-        writer.send(None)
-        for frame in frames:
-            writer.send(frame)
-        writer.close()
+        from imageio_ffmpeg import get_ffmpeg_exe
+    size = "x".join(str(round(side * DOTS)) for side in SIZE)
+    with temporary_folder() as folder:
+        file = folder / f"film{path.suffix.lower()}"
+        command = [get_ffmpeg_exe(), "-f", "rawvideo", "-s", size, "-pix_fmt", "rgba", *options, str(file)]
+        with suppress(BrokenPipeError), Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=DEVNULL) as encoder:
+            assert encoder.stdin is not None
+            for frame in frames:
+                encoder.stdin.write(frame)
+        if encoder.returncode:
+            where = f"exit status {encoder.returncode}; is there room in '{folder.parent}'?"
+            raise PlotError(f"cannot write '{path}': FFmpeg failed, {where}")
         return file.read_bytes()
 
 
