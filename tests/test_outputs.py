@@ -144,6 +144,15 @@ def test_a_disk_that_is_full_leaves_the_old_file(disk):
     assert path.read_bytes() == OLD and [*path.parent.iterdir()] == [path]
 
 
+def test_a_folder_for_temporary_files_that_is_full_is_named(disk, native_path, tmp_path):
+    full = disk(200)
+    (full / "fill").write_bytes(bytes(190 * 1024))
+    command = [sys.executable, "-m", "twodof", "page", str(native_path), "-o", str(tmp_path / "arm.html")]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "TMPDIR": str(full)}, check=False)
+    assert (done.returncode, done.stderr) == (1, f"twodof: error: '{full}': No space left on device\n")
+    assert not (tmp_path / "arm.html").exists()
+
+
 @pytest.mark.parametrize("verb", ["run", "sweep", "layouts", "fit robot.urdf bag"])
 def test_a_folder_is_no_standard_output(verb, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -26,6 +26,7 @@ METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # compression methods that
 MAX_LINKS_FOLLOWED = 40  # the kernel's limit
 TEMPORARY = ".twodof."
 """Prefix of temporary folders, whose process holds their lock or has died."""
+FEW_BYTES = 1_000_000  # free bytes of a disk that is almost full
 LOCK_TIMEOUT = 5.0  # s of waiting for a lock
 NUMBER = int | float
 VALUES = {str: NUMBER}
@@ -226,6 +227,11 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
         folder = folder.rename(folder.with_name(TEMPORARY + folder.name))
     try:
         yield folder
+    except OSError as error:
+        free = os.statvfs(folder)
+        if error.errno == errno.ENOSPC and error.filename is None and free.f_bavail * free.f_frsize < FEW_BYTES:
+            raise OSError(error.errno, error.strerror, str(parent)) from error
+        raise
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         os.close(held)

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from subprocess import DEVNULL
+from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -72,10 +73,12 @@ class Meshes:
         self._folder = self._stack.enter_context(temporary_folder())
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         for reader in self._readers.values():
             reader.close()
-        self._stack.close()
+        self._stack.__exit__(kind, error, trace)
 
     def scaled(self, name: str, scale: Array) -> list[Surface]:
         """Return the surfaces of a mesh, m; if it is unreadable, warn and return none."""
