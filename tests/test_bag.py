@@ -267,7 +267,7 @@ def test_sqlite3_has_the_tables_that_rosbag2_expects(recording):
 
 
 @both_storages
-def test_read_bag_gives_back_what_was_written(recording, storage):
+def test_read_bag_returns_the_written_samples(recording, storage):
     found = twodof.read_bag(recording.bag(storage, "effort"))
     assert found.joints == ("joint1", "joint2")
     np.testing.assert_array_equal(found.stamps, START * SECOND + PERIOD * np.arange(501))

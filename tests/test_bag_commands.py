@@ -136,7 +136,7 @@ def test_commands_in_memory_are_bounded(native_path, tmp_path, monkeypatch):
         ([("/a", BEGIN, joint_message(0, ["elbow"], (), (), (1.0,)))], None, "names no joint of this"),
     ],
 )
-def test_what_cannot_be_replayed(effort, tmp_path, capfd, messages, topic, reason):
+def test_bags_that_cannot_be_replayed(effort, tmp_path, capfd, messages, topic, reason):
     bag = write_third_party(tmp_path / "bag", messages)
     given = f"{bag}:{topic}" if topic else str(bag)
     assert main(["run", str(effort), "--input", given, "-o", str(tmp_path / "none")]) == 1

@@ -145,7 +145,7 @@ def test_guid_is_the_digest_of_description_sources_and_resources(fmu_path):
     assert guid == digest.hexdigest()
 
 
-def test_the_zip_holds_what_tools_and_people_look_for(fmu_path):
+def test_the_zip_has_the_files_that_tools_and_people_expect(fmu_path):
     with zipfile.ZipFile(fmu_path) as archive:
         names = archive.namelist()
         urdf = archive.read("resources/robot.urdf").decode()
@@ -416,7 +416,7 @@ def put(driver, name, value):
 
 
 @in_child_process
-def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
+def test_initial_unknowns_have_exactly_the_declared_dependencies(fmu_path):
     """Joints are inside their ranges and at limits, move in both directions, and are saturated or not."""
     with zipfile.ZipFile(fmu_path) as archive:
         description = etree.fromstring(archive.read("modelDescription.xml"))
@@ -493,7 +493,7 @@ def candidates(name, start):
 
 
 @in_child_process
-def test_outputs_depend_on_exactly_what_is_declared(fmu_path):
+def test_outputs_have_exactly_the_declared_dependencies(fmu_path):
     with zipfile.ZipFile(fmu_path) as archive:
         description = etree.fromstring(archive.read("modelDescription.xml"))
     expected = declared(description, "Outputs") | declared(description, "Derivatives")
@@ -547,7 +547,7 @@ def test_sizes_are_those_of_the_robot(fmu_path):
 
 
 @pytest.mark.parametrize("flavour", ["python", "native"])
-def test_what_the_description_excludes_is_refused_and_nothing_else(flavour, fmu_path, native_path):
+def test_calls_that_the_description_excludes_are_refused_and_no_others(flavour, fmu_path, native_path):
     driver = Driver(native_path if flavour == "native" else fmu_path)
     ranged = {
         v.name: side

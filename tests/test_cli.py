@@ -54,7 +54,7 @@ def rows(output: str) -> dict[str, str]:
     return dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())
 
 
-def test_build_says_what_it_built_and_what_to_do_next(session):
+def test_build_prints_its_result_and_the_next_commands(session):
     found = rows(session["build"])
     size = (Path(session["cwd"]) / "TwoDof.fmu").stat().st_size / 1024
     assert found["FMU"] == f"TwoDof.fmu ({size:.0f} KB, linux64)"
@@ -83,7 +83,7 @@ def test_run_says_how_far_the_end_effector_is_from_its_target(session):
     assert float(promised[1]) == pytest.approx(math.dist(x, (0.2, 0.05)), rel=5e-3)
 
 
-def test_run_says_how_fast_it_was_and_what_to_do_next(session):
+def test_run_prints_its_speed_and_the_next_commands(session):
     timing = re.fullmatch(r"1\.5 s simulated in ([\d.]+) s, ([\d.]+) × real time", rows(session["run"])["time"])
     assert timing is not None
     assert float(timing[2]) == pytest.approx(1.5 / float(timing[1]), rel=0.1)
@@ -93,7 +93,7 @@ def test_run_says_how_fast_it_was_and_what_to_do_next(session):
 
 @pytest.mark.parametrize("activated", [True, False])
 @pytest.mark.parametrize("missing", [[], ["matplotlib", "websockets"]])
-def test_what_is_suggested_can_be_typed(activated, missing, native_path, tmp_path):
+def test_suggested_commands_can_be_typed(activated, missing, native_path, tmp_path):
     """The shell finds the program or not; the extras for figures and pages are installed or not."""
     here = str(Path(sys.executable).parent)
     path = [p for p in os.environ["PATH"].split(os.pathsep) if Path(p) != Path(here)]
@@ -113,7 +113,7 @@ def test_what_is_suggested_can_be_typed(activated, missing, native_path, tmp_pat
     assert not re.search(r"(?<!/)twodof\[", done.stdout)  # a folder, no name for an index
 
 
-def test_info_of_a_bag_shows_what_is_in_it(session):
+def test_info_of_a_bag_shows_its_contents(session):
     found = rows(session["info bag"])
     bag = twodof.read_bag(Path(session["cwd"]) / "bag")
     assert found["joints"] == "joint1, joint2"
@@ -127,7 +127,7 @@ def test_info_of_a_bag_shows_what_is_in_it(session):
     assert topics == ["/joint_states", "151", "sensor_msgs/msg/JointState"]
 
 
-def test_info_of_an_fmu_shows_what_is_in_it(session):
+def test_info_of_an_fmu_shows_its_contents(session):
     found = rows(session["info fmu"])
     assert found["digest"] == twodof.load_fmu(Path(session["cwd"]) / "TwoDof.fmu").guid
     assert found["platforms"] == "linux64"
@@ -197,7 +197,7 @@ def test_warnings_of_the_robot_and_the_fmu_are_shown(command, folder):
     assert re.match(r"WARNING: q_start\[1\] = 9 of joint 'joint1' is outside its lim", line)
 
 
-def test_what_the_fmu_refuses_is_one_line_and_leaves_no_bag(folder):
+def test_a_refusal_of_the_fmu_is_one_line_and_leaves_no_bag(folder):
     done = twodof_command(*RUN, "--set", "q_min=1", "--set", "q_max=0", cwd=folder)
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(r"twodof: error: .*q_min\[1\] = 1 > q_max\[1\] = 0.*\n", done.stderr)

@@ -265,7 +265,7 @@ def test_states_of_instances_with_and_without_a_clock_are_apart(events: Any, law
         ({"part": "controller", "fmi": 3}, "the clock needs the controller's period; set control_period"),
     ],
 )
-def test_what_cannot_have_a_clock_is_not_built(tmp_path: Path, given: dict[str, Any], message: str) -> None:
+def test_an_fmu_that_cannot_have_a_clock_is_not_built(tmp_path: Path, given: dict[str, Any], message: str) -> None:
     with pytest.raises(BuildError, match=message):
         twodof.build_fmu(tmp_path / "a.fmu", twodof.FmuOptions(native=True, clocked=True, **given))
     assert not list(tmp_path.iterdir())

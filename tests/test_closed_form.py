@@ -123,7 +123,7 @@ SCHEDULE = [
 ]
 
 
-def test_inputs_that_change_give_what_an_integrator_gives() -> None:
+def test_inputs_that_change_give_the_results_of_an_integrator() -> None:
     """Targets, velocities, accelerations and gains change during the motion; some are zero."""
     step, steps = 0.01, 300
     x, v = np.array([0.23, 0.18]), np.array([0.4, -0.2])

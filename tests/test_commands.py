@@ -78,7 +78,7 @@ def test_invalid_commands(arm, control, cdr, kind, text):
     assert caught.value.kind == kind
 
 
-def test_what_a_control_follows(arm, fmu_path):
+def test_each_control_follows_its_own_messages(arm, fmu_path):
     types = {c: Commands(arm(c)).types for c in ("joint", "effort")}
     assert types == {"joint": (JOINT_STATE,), "effort": (JOINT_STATE,)}
     assert Commands(twodof.load_fmu(fmu_path)).types == (POINT,)

@@ -83,7 +83,7 @@ def test_signals_leave_a_complete_bag(native_path, tmp_path, name, storage, pace
         assert read_with_rosbags(bag) == whole(native_path, tmp_path, kept)
 
 
-def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch):
+def test_an_interrupt_does_not_disturb_the_end_by_another_one(monkeypatch):
     times = iter([5.0, 5.0 + 0.5 * signals.CLEAN_UP, 5.0 + 1.5 * signals.CLEAN_UP])
     monkeypatch.setattr(signals, "_interrupts", [])
     monkeypatch.setattr(signals, "time", SimpleNamespace(monotonic=lambda: next(times)))
@@ -94,7 +94,7 @@ def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch):
         signals.interrupt(signal.SIGINT, None)
 
 
-def test_what_ends_a_run_on_request_takes_its_time():
+def test_a_request_to_end_a_run_takes_its_time():
     with signals.asked_to_stop() as asked:
         os.kill(os.getpid(), signal.SIGTERM)
         assert signal.getitimer(signal.ITIMER_REAL)[0] > 0.0  # a step that hangs is interrupted

@@ -435,7 +435,7 @@ def test_states_by_real_variables_and_derivatives_by_real_variables(fmus):
     assert rates == other.rates() and rates[:2] == y[2:]
 
 
-def test_a_state_that_is_set_by_hand_decides_anew_what_rests(fmus):
+def test_a_state_that_is_set_by_hand_determines_the_resting_joints_again(fmus):
     model = Model(fmus["effort"], q_start=[0.5, 0.0], q_min=[0.5, -1.0])
     assert model.getReal([model.vr["der(v[1])"]]) == [0.0]  # it rests
     model.set(q=[0.6, 0.0])
@@ -475,7 +475,7 @@ def test_a_time_event_is_announced_until_it_is_past(fmus):
         assert (model.get("tau") != before) == (time in (0.004, 0.014))
 
 
-def test_what_is_out_of_turn_or_wrong_is_refused_and_changes_nothing(fmus):
+def test_calls_out_of_order_or_with_invalid_values_are_refused_and_change_nothing(fmus):
     model = Model(fmus["task"])
     four = (ctypes.c_double * 4)(0.1, 0.2, np.nan, 0.0)
     model.enterEventMode()  # the table of FMI 2.0.4 allows it in event mode too, that of 3.0.2 does not
@@ -585,7 +585,7 @@ def test_a_change_of_anything_gives_another_jacobian(fmus, change):
     assert np.abs(jacobian() - before).max() > 1e-3
 
 
-def test_a_derivative_of_what_has_none_is_refused(fmus):
+def test_a_derivative_of_a_variable_without_one_is_refused(fmus):
     model = Model(fmus["task"])
     call, vr = "getDirectionalDerivative", model.vr
     refused = [

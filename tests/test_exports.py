@@ -118,7 +118,7 @@ def test_bags_of_no_dataset_are_refused(bag_path, tmp_path, control, step, name,
     ("name", "message"),
     [("out.xlsx", "ends in .csv, .parquet, .mcap or .lerobot"), ("none/out.csv", "cannot write '.*none/out.csv'")],
 )
-def test_what_cannot_be_exported_is_refused(name, message, bag_path, tmp_path):
+def test_an_impossible_export_is_refused(name, message, bag_path, tmp_path):
     with pytest.raises(twodof.TwoDofError, match=message):
         twodof.export_bag(bag_path, tmp_path / name)
     assert not [*tmp_path.iterdir()]

@@ -116,7 +116,7 @@ def test_a_users_program_is_checked_by_its_types(tmp_path):
         ),
     ],
 )
-def test_a_keyword_that_is_none_is_told_of_the_function_that_was_called(call, told, native_path):
+def test_an_unknown_keyword_is_an_error_of_the_called_function(call, told, native_path):
     with pytest.raises(TypeError, match=f"^{told}"):
         call(native_path)
 
@@ -176,7 +176,7 @@ def test_the_picture_of_a_long_recording_keeps_its_extremes(native_path, tmp_pat
     assert "-3.5 to 7.25" in html and len(html) < 30_000
 
 
-def test_a_control_that_is_none_is_told_where_it_was_typed():
+def test_an_unknown_control_is_an_error_of_the_called_function():
     with pytest.raises(twodof.TwoDofError, match=r"^`control` 'jont' is .*; did you mean 'joint'"):
         twodof.FmuOptions(control="jont")
 
@@ -194,7 +194,7 @@ def test_reprs_are_one_line(native_path, tmp_path):
     assert repr(bag) == f"<Recording '{tmp_path / 'bag'}': 6 samples in 0.05 s of joint1, joint2>"
 
 
-def test_recording_has_what_the_samples_had(native_path, tmp_path):
+def test_recording_has_the_values_of_the_samples(native_path, tmp_path):
     samples = []
     run = twodof.experiment(native_path, stop_time=0.5)
     steps = twodof.samples(run)
@@ -252,7 +252,7 @@ for call in sys.argv[1:]:
 """
 
 
-def test_what_needs_an_extra_says_so_when_it_is_used(tmp_path):
+def test_a_name_that_needs_an_extra_names_it_when_it_is_used(tmp_path):
     names = ["websockets", "matplotlib", "pyarrow", "cyclonedds"]
     errors = program(names, CALLS, tmp_path, *ABSENT).splitlines()
     for error, extra in zip(errors, ABSENT.values(), strict=True):
@@ -277,6 +277,6 @@ def test_columns_of_a_csv_are_named_as_settings_are(native_path, tmp_path):
         twodof.experiment(native_path, input_file=tmp_path / "in.csv")
 
 
-def test_versions_are_of_what_is_installed():
+def test_versions_are_those_of_the_installed_packages():
     """A run without Pinocchio also records versions."""
     assert versions("numpy", "no-such-package") == {"twodof": twodof.__version__, "numpy": np.__version__}

@@ -313,7 +313,7 @@ def test_wrong_arrays_are_refused(pair):
     a.refused("weight of x\\[1\\] is not finite", "getAdjointDerivative", [a.vr["x"]], [q], [np.nan, 0.0], 2)
 
 
-def test_what_the_description_does_not_have_is_refused(pair):
+def test_variables_outside_the_description_are_refused(pair):
     fmu = pair()[1]
     a = arm(fmu)
     for kind in ("CoSimulation", "ModelExchange"):

@@ -106,7 +106,7 @@ def test_a_sweep_over_a_vector(oscillators):
     np.testing.assert_allclose(table["peak_velocity"].to_numpy(), peaks, rtol=1e-12)
 
 
-def test_its_bag_and_what_is_said_of_it(oscillators, tmp_path, capsys):
+def test_its_bag_and_the_printed_facts(oscillators, tmp_path, capsys):
     bag = twodof.Bag(tmp_path / "bag")
     twodof.simulate(oscillators, bag, stop_time=1.0)
     recording = twodof.read_bag(tmp_path / "bag")

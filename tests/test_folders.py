@@ -52,7 +52,7 @@ def waiting_run(fmu, folder):
 
 
 @pytest.mark.parametrize("foreign", [False, True])
-def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(native_path, tmp_path, monkeypatch, foreign):
+def test_the_rest_of_a_killed_run_is_removed_by_the_next_and_nothing_else(native_path, tmp_path, monkeypatch, foreign):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     others = tmp_path / "others"
     others.mkdir()
@@ -107,7 +107,7 @@ def test_a_folder_that_could_not_be_locked_is_never_taken_for_abandoned(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_place_for_temporary_folders_is_told(monkeypatch):
+def test_a_missing_folder_for_temporary_files_is_named(monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
     with pytest.raises(OSError, match=r"'/nowhere'.*; name one in TMPDIR"):

@@ -92,7 +92,7 @@ def test_the_command_line_tells_where_it_listens(native_path, number):
         ("x_des", 1.0, "'x_des' is not a gain of this FMU"),
     ],
 )
-def test_what_is_no_gain_is_ignored(native_path, caplog, name, value, reason):
+def test_parameters_that_are_no_gains_are_ignored(native_path, caplog, name, value, reason):
     """There is one warning, however often it arrives."""
     viewer = Foxglove(0, set_gains=True).begin(twodof.experiment(native_path))
     asked = {"name": name} if value is None else {"name": name, "value": value}

@@ -93,7 +93,7 @@ def test_derivatives_are_those_of_pinocchio(fmus: dict[str, Path]) -> None:
                 np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-11, err_msg=f"{group}, {i}")
 
 
-def test_what_depends_on_a_free_parameter_follows_it(fmus: dict[str, Path]) -> None:
+def test_variables_that_depend_on_a_free_parameter_follow_it(fmus: dict[str, Path]) -> None:
     """The mass matrix, and in initialization mode the impact on a stop."""
     at_the_limit = {"q_start": [np.pi, 0.3], "v_start": [1.0, 0.5], "q_max": [np.pi, np.pi]}
     values = []
@@ -114,7 +114,7 @@ def test_what_depends_on_a_free_parameter_follows_it(fmus: dict[str, Path]) -> N
     "control, unknown, knowns",
     [("effort", "der(v[1])", VALUES), ("task", "tau[1]", {*VALUES} - {"friction", "damping"})],
 )
-def test_the_description_tells_what_depends_on_them(
+def test_the_description_has_their_dependents(
     fmus: dict[str, Path], tmp_path: Path, control: str, unknown: str, knowns: Any
 ) -> None:
     fmu = fmus["free"]
@@ -160,6 +160,6 @@ def test_an_fmu_with_free_parameters_passes_the_checks(tmp_path: Path, control: 
         ({"free": ("payload",), "native": True, "part": "controller"}, "the whole robot"),
     ],
 )
-def test_what_cannot_be_free_is_refused(given: dict[str, Any], message: str) -> None:
+def test_an_impossible_free_parameter_is_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises(BuildError, match=message):
         twodof.FmuOptions(**given)

@@ -98,7 +98,7 @@ def test_an_obj_has_the_colours_of_its_library():
     assert sum(len(part.triangles) for part in plain) == 12
 
 
-def test_what_has_no_colours_or_cannot_be_read():
+def test_meshes_without_colours_or_that_cannot_be_read():
     triangle = b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
     files = {"a.stl": triangle + b"endloop\nendfacet\nendsolid a\n", "b.dae": b"<a", "c.obj": b"v"}
     (part,) = surfaces("a.stl", files.get, ONE)

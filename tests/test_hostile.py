@@ -33,7 +33,7 @@ ANYWHERE = ("a pipe", "3 GB of zeros")  # the others one function refuses for al
     ("what", "kind"),
     [("fmu", kind) for kind in SPECIAL] + [(what, kind) for what in ("urdf", "csv", "mesh") for kind in ANYWHERE],
 )
-def test_what_is_no_file_of_bearable_size_is_refused(what, kind, jail, native_path):
+def test_a_file_beyond_the_limit_or_no_regular_file_is_refused(what, kind, jail, native_path):
     make, reason = SPECIAL[kind]
     path = jail.input / what
     make(path)

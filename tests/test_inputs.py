@@ -117,7 +117,7 @@ def test_setting_that_does_not_fit_the_fmu_is_refused(fmu, settings, culprit):
 
 
 @pytest.mark.parametrize("unknown", ["tau[3]", "q1", "v[9]"])
-def test_what_is_suggested_can_be_set(fmu, unknown):
+def test_suggested_names_can_be_set(fmu, unknown):
     with pytest.raises(InputError, match=r"did you mean|there are") as refusal:
         resolve(fmu, {unknown: 1.0})
     _, _, suggested = str(refusal.value).partition("did you mean '")
@@ -258,7 +258,7 @@ def test_rows_before_the_start_hold_at_the_start(fmu, tmp_path):
 
 
 @pytest.mark.parametrize(("end", "late"), [(0.05, 3), (0.06, 0)])
-def test_rows_after_the_end_are_told(fmu, tmp_path, caplog, end, late):
+def test_rows_after_the_end_are_reported(fmu, tmp_path, caplog, end, late):
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0.06,0.3\n0.06,0.1\n0.06,0.1\n")
     twodof.experiment(fmu, stop_time=end, input_file=tmp_path / "inputs.csv", stamp_start=0)
     twodof.experiment(fmu, stop_time=end, changes=[(0.06, {"x_des": 0.1})], stamp_start=0)
@@ -331,6 +331,6 @@ def test_changes_that_cannot_be_are_refused_before_the_run(fmu, changes, culprit
         twodof.experiment(fmu, changes=changes)
 
 
-def test_an_element_beyond_a_vectors_end_is_told_as_such(fmu):
+def test_an_element_beyond_the_end_of_a_vector_is_named(fmu):
     with pytest.raises(InputError, match=r"no variable 'Kp\[3\]': Kp has 2 elements"):
         twodof.experiment(fmu, settings={"Kp[3]": 1.0})

@@ -65,7 +65,7 @@ def test_plotjuggler_draws_each_field_of_each_joint(bag):
     assert curves == {f"/joint_states/{name}/{field}" for name in names for field in fields}
 
 
-def test_foxglove_draws_what_messages_hold(bag):
+def test_foxglove_draws_the_contents_of_messages(bag):
     layout = json.loads((bag.parent / "Arm 1.foxglove.json").read_text("utf-8"))
     panels, messages = layout["configById"], recorded(bag)
     fields = {"position": 2, "velocity": 3, "effort": 4}

@@ -71,7 +71,7 @@ def test_an_equilibrium_holds_still(bare):
         ("python", {}, "has no directional derivatives; build a native FMU"),
     ],
 )
-def test_what_has_no_linear_model_is_refused(fmu, at, message, bare, native_path, fmu_path):
+def test_a_state_without_a_linear_model_is_refused(fmu, at, message, bare, native_path, fmu_path):
     path = {"bare": bare, "task": native_path, "python": fmu_path}[fmu]
     if at.get("rcond") == "ratio":
         s, c = np.sin([0.3, 1.1]), np.cos([0.3, 1.1])
@@ -94,7 +94,7 @@ def test_a_joint_that_sticks_is_remarked_and_stays_and_one_that_begins_to_slip_i
         twodof.linearise(bare, {"q": [0.3, 0.2], "friction": 0.1, "tau_cmd": [9.0, 0.0]})
 
 
-def test_a_free_joint_has_no_damping_and_what_falls_is_unstable(bare, capsys):
+def test_a_free_joint_has_no_damping_and_a_falling_arm_is_unstable(bare, capsys):
     """Without gravity, joints are free; upright, two of four eigenvalues are unstable."""
     free = twodof.linearise(bare, {"q": [0.3, 0.3], "gravity": 0.0})
     assert [mode.eigenvalue for mode in free.modes] == [0.0] * 4

@@ -232,7 +232,7 @@ def test_a_parameter_begins_the_run_anew(page):
 ORDERS = (["no order"], ["[]"], ['["leave", 1]'], ['["change", 3]'], ['["change"]'], ["{}"], [b"\xff"], ["x" * 100_000])
 
 
-def test_who_gives_no_orders_is_not_listened_to(command, page):
+def test_a_client_that_sends_invalid_orders_is_disconnected(command, page):
     for orders in ORDERS:
         with open_socket(socket_of(command)) as connection:
             for order in orders:
@@ -281,7 +281,7 @@ def test_a_flood_of_requests_does_not_delay_updates(command, page):
             pass
 
 
-def test_a_setting_that_is_none_is_told_as_text(command, page):
+def test_an_invalid_setting_is_reported_as_text(command, page):
     def ask(name: str, value: object, number: int) -> None:
         latest(command, lambda news: news["noted"] == number, ["change", {name: value}])
         until(page, lambda said: name.split("[")[0][:50] in said, told)
@@ -394,7 +394,7 @@ def test_the_page_talks_to_its_server_alone(shown, command):
             other.accept()
 
 
-def test_recording_is_what_was_shown(page, folder, native_path):
+def test_recording_equals_the_shown_motion(page, folder, native_path):
     type_into(page, "x_des[1], m", 0.2)
     type_into(page, "x_des[2], m", 0.05)
     press(page, "Play")

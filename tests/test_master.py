@@ -204,7 +204,7 @@ def test_a_run_continues_at_rest_after_a_discarded_step(native_path):
         assert sample.q + sample.v == pytest.approx(expected.q + expected.v, abs=1e-9)
 
 
-def test_what_a_run_goes_on_with_holds_since_then(native_path, monkeypatch):
+def test_inputs_of_a_continued_run_hold_since_then(native_path, monkeypatch):
     """No input was set before the discarded step."""
     fmu = twodof.load_fmu(native_path)
     broken: list[float] = []
@@ -230,7 +230,7 @@ def test_a_loop_of_ones_own_is_paced(native_path, clock):
         assert clock.now - 1e6 == pytest.approx(sample.t)
 
 
-def test_what_cannot_run_together_opens_no_sink(native_path, monkeypatch):
+def test_runs_that_do_not_go_together_open_no_sink(native_path, monkeypatch):
     recorder = Recorder()
     monkeypatch.setattr(recorder, "begin", lambda run: pytest.fail("it was opened"))
     options: dict[str, Any] = {"stop_time": 0.1, "stamp_start": 0.0}
@@ -280,7 +280,7 @@ def test_a_refusal_of_the_fmu_comes_with_its_own_words(native_path):
     ],
 )
 @in_child_process
-def test_an_fmu_that_misbehaves_ends_the_run_with_what_was_good(fmu_path, tmp_path, inside, message):
+def test_an_fmu_that_fails_ends_the_run_with_the_valid_samples(fmu_path, tmp_path, inside, message):
     recorder = Recorder()
     with pytest.raises(SimulationError, match=message):
         twodof.simulate(changed_step(fmu_path, tmp_path, inside), recorder, stop_time=1.0)

@@ -222,7 +222,7 @@ def test_characters_that_trouble_file_systems_are_replaced(disk):
     assert list(files) == ["meshes/with_space___more.stl"]
 
 
-def test_collected_robot_collects_again_from_what_was_collected(disk, tmp_path):
+def test_collected_robot_can_be_collected_again(disk, tmp_path):
     uris = [f"package://arm_description/meshes/{kind}/link.stl" for kind in ("visual", "collision")]
     text, files = collect_meshes(urdf(PACKAGE, *uris), disk, disk / "ws")
     for name, content in files.items():

@@ -107,7 +107,7 @@ def test_no_effort_exceeds_its_bound(name):
         assert (np.abs(tau) <= bound * (1.0 + 1e-9)).all()
 
 
-def test_effort_bound_is_what_holds_a_stretched_arm():
+def test_effort_bound_is_the_holding_effort_of_a_stretched_arm():
     robot, still = model("twodof").robot, np.zeros(2)
     constants, gravity = joint_tree(robot), np.array([0.0, -9.81, 0.0])
     reference = robot.model.copy()

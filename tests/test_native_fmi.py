@@ -388,7 +388,7 @@ def test_a_state_with_a_right_checksum_and_a_wrong_field_is_refused(field):
 @pytest.mark.parametrize(
     "field", ["initialised", "has_x", "has_tau", "has_stops", "has_rates", "any_held", "x[1]", "tau[1]", "der(v[1])"]
 )
-def test_what_a_state_computes_on_demand_is_not_taken_from_its_bytes(field):
+def test_values_computed_on_demand_are_not_taken_from_the_bytes_of_a_state(field):
     arm, other = Arm(), Arm(start=False)
     arm.step()
     arm.outputs()
@@ -397,7 +397,7 @@ def test_what_a_state_computes_on_demand_is_not_taken_from_its_bytes(field):
         assert other.outputs() == arm.outputs()
 
 
-def test_a_state_from_before_the_run_keeps_what_is_yet_to_be_refused():
+def test_a_state_from_before_the_run_keeps_pending_errors():
     arm = Arm(start=False)
     arm.set("q_min[1]", 4.0)
     saved = arm.deSerializeFMUstate(arm.snapshot())

@@ -410,7 +410,7 @@ def refused(folder: Path, *platforms: str) -> str:
     "platform, reason",
     [("win64", "this machine's own compiler builds for linux64"), ("linux64", "this machine has no C compiler")],
 )
-def test_what_is_not_there_to_compile_with_is_named(platform, reason, tmp_path, without_zig, monkeypatch):
+def test_a_missing_compiler_is_named(platform, reason, tmp_path, without_zig, monkeypatch):
     if platform == "linux64":
         monkeypatch.setenv("PATH", str(tmp_path))
     message = refused(tmp_path, platform)

@@ -54,14 +54,14 @@ def test_a_notebook_runs_and_its_stored_outputs_are_current(name, tmp_path):
     assert path.stat().st_size < MAX_SIZE
 
 
-def test_an_arm_is_shown_without_what_takes_long_to_import(native_path):
+def test_an_arm_is_shown_without_slow_imports(native_path):
     code = "import sys, twodof; twodof.show(sys.argv[1]); print({*sys.modules} & {'matplotlib', 'pinocchio', 'pandas'})"
     done = subprocess.run([sys.executable, "-c", code, native_path], check=True, stdout=subprocess.PIPE, text=True)
     assert done.stdout == "set()\n"
 
 
 @pytest.mark.parametrize(("silence", "shown"), [(0, True), (1e6, False)])
-def test_a_notebook_shows_bars_of_what_takes_long(native_path, tmp_path, silence, shown):
+def test_a_notebook_shows_progress_bars_of_long_tasks(native_path, tmp_path, silence, shown):
     """They are text without ipywidgets, else widgets; a script shows none."""
     shutil.copy(native_path, tmp_path / "arm.fmu")
     begin = f"import os, twodof\nfrom twodof.simulation import progress\nprogress.SILENCE = {silence}"
@@ -126,6 +126,6 @@ def test_pages_are_shown_inline_without_a_network(native_path, tmp_path):
 
 
 @pytest.mark.parametrize("other", [3, [1.0, 2.0]])
-def test_what_cannot_be_shown_is_said(other):
+def test_objects_that_cannot_be_shown_are_named(other):
     with pytest.raises(twodof.TwoDofError, match="`show` shows an FMU, a recording, the table of a sweep, or the path"):
         twodof.show(other)

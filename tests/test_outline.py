@@ -57,7 +57,7 @@ def test_every_line_keeps_its_extremes_wherever_it_is_looked_at(bag):
             assert some[here].max() >= np.sort(every[low:high])[-len(every) // 50]
 
 
-def test_what_is_told_of_a_long_bag_is_told_of_all_its_samples(bag):
+def test_facts_about_a_long_bag_use_all_its_samples(bag):
     whole, few = track_of(bag, 10**6), track_of(bag, MOST)
     assert whole.task is not None and few.task is not None
     assert few.task.off is not None and whole.task.off is not None

@@ -293,7 +293,7 @@ def test_the_arm_runs_in_real_time_and_is_seen_where_it_is(page, arm) -> None:
         assert abs(np.sin(seen - angle)) < 0.05
 
 
-def test_what_the_buttons_and_keys_do(page) -> None:
+def test_the_buttons_and_keys_have_their_effects(page) -> None:
     page.locator("#arm-scene").click()
     page.keyboard.press(" ")
     until(page, lambda k: k > 0, lambda page: page.evaluate("arm.k"))
@@ -415,7 +415,7 @@ def said(page: Page) -> str:
     return str(page.locator("#arm-message").text_content())
 
 
-def test_the_url_has_what_was_set(browser, arm, page) -> None:
+def test_the_url_has_the_settings(browser, arm, page) -> None:
     page.evaluate("() => { arm.set('Kp', [80, 60]); arm.set('x_des[2]', -0.1); arm.set('limit_effort', true); }")
     expected = "#x_des=0.2,-0.1&Kp=80,60&limit_effort=true"
     until(page, lambda found: sorted(found[1:].split("&")) == sorted(expected[1:].split("&")), fragment)
@@ -590,7 +590,7 @@ def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:
         assert_shown_as_text(page, "joint2")
 
 
-def test_what_an_fmu_refuses_is_said_and_changes_nothing(page) -> None:
+def test_a_value_that_an_fmu_refuses_is_reported_and_changes_nothing(page) -> None:
     assert "rtol = 0 must be > 0" in refused(page, "arm.set('rtol', 0)")
     assert page.evaluate("arm.held('rtol')") == [1e-3]
     for name, value, message in (
@@ -680,7 +680,7 @@ def test_the_scripts_are_typed_and_short() -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_a_script_uses_what_it_declares_or_imports_alone() -> None:
+def test_a_script_uses_only_its_declarations_and_imports() -> None:
     command = [needs("eslint"), "-c", "tests/eslint.config.js", "fmu_src/page", "twodof/plots"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -202,7 +202,7 @@ def importer(fmus):
         instance.close()
 
 
-def test_the_touch_is_as_short_as_is_said(importer):
+def test_the_contact_is_as_short_as_documented(importer):
     """Without stops, by differences of an importer's own solver."""
     rows = importer({**TOUCH, **FREE}).run(0.08, 1e-5, 1e-5)
     below = np.flatnonzero(rows[:, 1] < -math.pi)
@@ -274,7 +274,7 @@ def test_a_step_that_the_engine_cannot_integrate_is_warned_of(importer):
     assert not solver.asked
 
 
-def test_what_passes_no_stop_is_the_same_as_without_the_call(importer):
+def test_a_motion_that_passes_no_stop_is_the_same_as_without_the_call(importer):
     """Results are bit-identical, with located stops."""
     starts = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0, "v_start[1]": 2.0}
     told, silent = importer(starts), importer(starts)

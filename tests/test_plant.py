@@ -340,7 +340,7 @@ def test_gravity_is_a_parameter():
 
 
 @pytest.mark.parametrize("gain", [1e308, -1e308])
-def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -> None:
+def test_speeds_beyond_all_bounds_are_reported_by_the_exception_alone(gain: float) -> None:
     plant = default_arm()
     plant.Kp = [gain] * 2
     before = plant.q, plant.v
@@ -376,7 +376,7 @@ def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
     assert plant.q == q and not any(plant.v)
 
 
-def test_what_is_not_said_has_the_documented_start() -> None:
+def test_unset_variables_have_the_documented_start() -> None:
     task, bare = model("twodof").plant(), model("twodof", "effort").plant()
     assert (task.rtol, task.atol, task.max_step, task.rcond) == (1e-3, 1e-6, 1e-3, 0.01)
     assert bare.tau_cmd == bare.tau_ext == [0.0, 0.0] and bare.f_ext == bare.payload_com == [0.0] * 3

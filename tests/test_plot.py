@@ -44,7 +44,7 @@ def test_joints_are_drawn_as_the_fmu_gave_them(default, figure):
             assert axes.get_xlim() == (0.0, 5.0)
 
 
-def test_units_and_settings_are_told(figure):
+def test_units_and_settings_are_printed(figure):
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad"
     assert found.v[0].get_title("left") == "Velocity in rad/s"
@@ -108,7 +108,7 @@ def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default, f
     assert legend_of(error) == ["closed form"]
 
 
-def test_what_came_out_is_told(default, figure):
+def test_the_outcome_is_printed(default, figure):
     left = np.linalg.norm(default.x[-1] - (0.2, 0.05))
     told = "\n".join(texts(figure))
     found = re.search(r"^reached: (\S+) m from the target .*^at most (\S+) m from the closed form", told, re.M | re.S)
@@ -137,7 +137,7 @@ def test_limits_are_lines_that_are_in_view_where_they_are_near(fmu_path, tmp_pat
     assert not any(lines(axes, "limit") for axes in found.v)
 
 
-def test_equal_limits_are_told_once(figure):
+def test_equal_limits_are_printed_once(figure):
     first = panels(figure).q[0]
     assert heights(first, "limit") == [-math.pi, math.pi]
     assert notes(first) == ["limits ±3.14"]
@@ -278,7 +278,7 @@ DISTURBED: dict[str, tuple[str, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("urdf", "settings", "label"), DISTURBED.values(), ids=list(DISTURBED))
-def test_the_closed_form_says_what_it_leaves_out(urdf, settings, label, tmp_path):
+def test_the_closed_form_names_the_omitted_parts(urdf, settings, label, tmp_path):
     fmu = build(tmp_path, urdf, axes="xy", q_start=(0.3, 0.5))
     settings = {"x_des": (0.3, 0.6), **settings}
     recording = record(tmp_path / "bag", fmu, stop_time=0.5, settings=settings)
@@ -342,7 +342,7 @@ def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path, tmp_path):
 
 
 @pytest.mark.parametrize("at", [4321.987, -1e-3])
-def test_ticks_of_what_does_not_move_differ(default, at):
+def test_ticks_of_a_constant_curve_differ(default, at):
     run = long_run(default, np.full((200, 2), at))
     figure = plot(replace(run, v=run.q, tau=run.q))
     FigureCanvasAgg(figure).draw()
@@ -356,7 +356,7 @@ def test_ticks_of_what_does_not_move_differ(default, at):
 # --- several bags ---
 
 
-def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains):
+def test_labels_of_bags_that_differ_in_a_gain_contain_it(gains):
     """Each has one line style in all panels."""
     figure = plot(*(recording.bag for recording in gains.values()))
     names = ["Kp = 20 s⁻²", "Kp = 50 s⁻²", "Kp = 400 s⁻²"]
@@ -413,7 +413,7 @@ LABELS: dict[str, tuple[list[dict[str, Any]], list[str]]] = {
 
 
 @pytest.mark.parametrize(("runs", "expected"), LABELS.values(), ids=list(LABELS))
-def test_labels_say_what_differs(runs, expected, default):
+def test_labels_name_the_differences(runs, expected, default):
     bag = twodof.read_bag(default.bag)
     bags = []
     for run in runs:

@@ -292,7 +292,7 @@ def test_a_window_opens_where_there_is_a_display(default, tmp_path):
 # --- what is wrong ---
 
 
-def test_what_else_is_wrong_is_named(default, tmp_path, monkeypatch):
+def test_further_faults_are_named(default, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     drawn = drawing(read_tracks([default.bag]))
     Path("folder.png").mkdir()
@@ -318,7 +318,7 @@ def test_what_else_is_wrong_is_named(default, tmp_path, monkeypatch):
     assert file_kind("x/y.HTML") == "html"
 
 
-def test_without_matplotlib_it_says_what_to_install():
+def test_without_matplotlib_it_names_the_package_to_install():
     code = "import sys; sys.modules['matplotlib'] = None; import twodof.plots.runs"
     done = python("-c", code, env=ENVIRONMENT)
     last = done.stderr.strip().splitlines()[-1]
@@ -338,7 +338,7 @@ def test_joints_are_chosen(default, tmp_path, capsys):
     assert main(["plot", str(default.bag), "--joints", "joint2,joint1", *output]) == 0
 
 
-def test_the_command_says_where_the_plot_is_and_what_came_out(gains, foreign, ur5, tmp_path, monkeypatch, capsys):
+def test_the_command_prints_the_path_of_the_plot_and_the_verdict(gains, foreign, ur5, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ur5.urdf").write_text(ur5)
     options = ["--urdf", "ur5.urdf", "--frame", "forearm_link"]

@@ -48,7 +48,7 @@ def test_a_page_has_the_curves_of_the_bags(gains):
         np.testing.assert_allclose(traces(time, "", "error")[i][:, 1], error, atol=1e-15)
 
 
-def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(default, tmp_path):
+def test_a_page_of_an_hour_is_small_and_names_the_omitted_parts(default, tmp_path):
     """It keeps extremes, and a jump of one sample in a curve with larger swings."""
     n, jumps = 360_000, np.array([11_113, 130_077, 347_042])
     noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))

@@ -130,7 +130,7 @@ def test_motion_in_a_plane_is_seen_in_that_plane(axes, expected, tmp_path):
         assert farthest <= reach + 1e-12
 
 
-def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path):
+def test_only_points_in_the_plane_count_for_the_circle(tmp_path):
     """Joints of links of 0.24 × 0.32 × 0.1 m rotate about z: only the top view is drawn."""
     urdf = chain_urdf("zz").replace('<origin xyz="0.4 0 0"/>', '<origin xyz="0.24 0.32 0.1"/>')
     above, beside = panels(seen(tmp_path, urdf, ["j1", "j2"], *waves(2))).views

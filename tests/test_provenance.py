@@ -206,7 +206,7 @@ def _renamed_root(urdf: Path) -> Path:
     return other
 
 
-def test_what_is_not_known_is_not_shown(native_path, tmp_path):
+def test_unknown_facts_are_not_shown(native_path, tmp_path):
     """The file of changes is full: no distance is shown after its end."""
     bag = tmp_path / "bag"
     by_sending(native_path, bag, Collector())
@@ -317,7 +317,7 @@ def test_provenance_says_where_it_was_full(run, tmp_path, monkeypatch):
     assert provenance["inputs_known_until"] == round(changes[-1][0] * 100 + 1) / 100
 
 
-def test_changes_beyond_what_a_reader_holds_are_not_known(run, tmp_path):
+def test_changes_beyond_the_limit_of_a_reader_are_not_known(run, tmp_path):
     """Each of 4000 inputs changes once: a file of 100 kB has 8 million values in effect."""
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(5):

@@ -75,7 +75,7 @@ def test_fast_dds_receives_every_field_of_the_bag(native_path, tmp_path, number,
     assert 0 < min(delays) < 0.02 * SECOND  # of those that a busy machine did not hold up
 
 
-def test_who_comes_late_gets_what_is_latched_and_the_last_sample_before_a_signal(
+def test_a_late_subscriber_receives_latched_messages_and_the_last_sample_before_a_signal(
     native_path, tmp_path, number, listen, length
 ):
     bag = tmp_path / "bag"
@@ -421,7 +421,7 @@ def test_a_network_that_cannot_be(native_path, monkeypatch, capfd, variables, cu
     assert re.match(f"twodof: error: .*{culprit}", line), line
 
 
-def test_without_cyclone_dds_it_says_what_to_install(native_path):
+def test_without_cyclone_dds_it_names_the_package_to_install(native_path):
     missing = "import sys; sys.modules['cyclonedds'] = None; "
     code = missing + "from twodof.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "publish", str(native_path)]
@@ -437,7 +437,7 @@ def test_options_beside_an_experiment_are_refused(native_path):
         twodof.publish(run, stop_time=1.0)
 
 
-def test_a_publisher_tells_each_run_what_holds_for_it(native_path, number, listen):
+def test_a_publisher_sends_each_run_its_own_settings(native_path, number, listen):
     """The second run may have another robot."""
     publisher = twodof.Publisher(network_of_environment(environment(number)), scene=True)
     run = twodof.experiment(native_path, stop_time=0.02)
@@ -466,7 +466,7 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(tmp_path, monkeypatch, 
     assert told in capsys.readouterr().err
 
 
-def test_a_robots_name_is_told_as_it_was_given(native_path, capsys):
+def test_the_name_of_a_robot_is_printed_as_given(native_path, capsys):
     assert main(["publish", f"1={native_path}", "--stop-time", "0.01"]) == 1
     assert "NAME=FMU '1' is not a valid ROS 2 name" in capsys.readouterr().err
     run = twodof.experiment(native_path, stop_time=0.1)

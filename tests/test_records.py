@@ -217,7 +217,7 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize(("what", "compression"), [("an arm", "lz4"), ("a humanoid", "zstd"), ("a heartbeat", "zstd")])
-def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path, what, compression):
+def test_mcap_of_a_robot_at_rest_is_read_at_any_length(tmp_path, what, compression):
     """It has the best compression, chunks of 4 MiB, and no index between them.
 
     No honest file is smaller; each chunk adds enough to the read budget, so a file of a day is read.

@@ -98,7 +98,7 @@ def test_killed_run_loses_a_second_at_most(native_path, tmp_path, storage, lengt
 # --- what was lost is the end alone ---
 
 
-def test_mcap_cut_anywhere_keeps_what_came_before(run, tmp_path):
+def test_mcap_cut_anywhere_keeps_the_messages_before(run, tmp_path):
     bag = unfinished(tmp_path, run, "mcap", 200, scene=True)
     whole = (bag / "bag.mcap").read_bytes()
     everything = [joint_state(k, sample(run, k)) for k in range(200)]
@@ -133,7 +133,7 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run, tmp_path):
 
 
 @pytest.mark.parametrize("part", [0.95, 0.5])
-def test_sqlite3_file_without_its_end_keeps_what_comes_before(run, tmp_path, part):
+def test_sqlite3_file_without_its_end_keeps_the_messages_before(run, tmp_path, part):
     """The reference is SQLite, given a header with the right number of pages."""
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
@@ -381,7 +381,7 @@ def test_damaged_provenance_does_not_keep_the_messages(run, tmp_path):
 
 
 @pytest.mark.parametrize("place", ["nowhere", "file", "empty", "no bag", "both", "taken"])
-def test_what_cannot_be_recovered_is_refused_and_left_alone(run, tmp_path, place):
+def test_an_unrecoverable_bag_is_refused_and_left_alone(run, tmp_path, place):
     bag = unfinished(tmp_path, run, "mcap", 10)
     if place == "taken":
         (tmp_path / "bag.unfinished").mkdir()

@@ -353,7 +353,7 @@ EXTRAS = {
 
 
 @pytest.mark.parametrize("extra", EXTRAS.values(), ids=EXTRAS)
-def test_what_is_not_the_mechanism_is_ignored(extra: str) -> None:
+def test_elements_beside_the_mechanism_are_ignored(extra: str) -> None:
     loaded = load_robot(arm(extra), "tip", "xyz")
     assert loaded.joints == ("shoulder", "elbow")
     assert_same_mechanism(loaded, arm())
@@ -363,7 +363,7 @@ UNUSED = {"safety controller": "<safety_controller/>", "unknown": "<note>x</note
 
 
 @pytest.mark.parametrize("unused", UNUSED.values(), ids=UNUSED)
-def test_what_a_joint_has_beside_the_mechanism_is_ignored(unused: str) -> None:
+def test_elements_of_a_joint_that_are_not_its_mechanism_are_ignored(unused: str) -> None:
     assert load_robot(arm(elbow=elbow(LIMIT + unused)), "tip", "xyz").joints[1] == "elbow"
 
 
@@ -398,7 +398,7 @@ def test_elements_may_be_nested() -> None:
     assert load_robot(arm(deep), "tip", "xyz").joints == ("shoulder", "elbow")
 
 
-def test_mass_of_a_moving_body_may_be_in_what_is_fixed_to_it() -> None:
+def test_mass_of_a_moving_body_may_be_in_a_link_that_is_fixed_to_it() -> None:
     urdf = arm(link("tool"), joint("fixed", "tip", "tool", kind="fixed"), tip=link("tip", ""))
     assert load_robot(urdf, "tool", "xyz").joints == ("shoulder", "elbow")
 

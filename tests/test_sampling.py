@@ -326,7 +326,7 @@ def test_every_flavour_rounds_alike(fmus, kind, q, seen):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_velocities_are_differences_of_what_is_measured(fmus, kind):
+def test_velocities_are_differences_of_measured_positions(fmus, kind):
     settings = dict(control_period=0.01, q_resolution=1e-3, q_noise=1e-4, seed=3, v_from_q=True, q_des=1.0, v_start=0.5)
     rows = run(fmus("slider", "joint", kind), 0.5, 0.01, **settings)
     q_meas, v_meas = rows[:, 3], rows[:, 4]
@@ -337,7 +337,7 @@ def test_velocities_are_differences_of_what_is_measured(fmus, kind):
     assert np.abs(q_meas - rows[:, 0]).max() < 1.5e-3
 
 
-def test_the_effort_is_that_of_what_is_seen_within_the_limits(fmus):
+def test_the_effort_is_that_of_the_measured_state_within_the_limits(fmus):
     settings = {"control_period": 0.01, "q_noise": 0.05, "v_noise": 0.5, "seed": 9, "q_des": 1.0}
     for limit in (False, True):
         rows = run(fmus("slider", "joint", "fmi2"), 0.3, 0.01, **settings, limit_effort=limit, Kp=900.0)
@@ -347,7 +347,7 @@ def test_the_effort_is_that_of_what_is_seen_within_the_limits(fmus):
         assert np.abs(rows[:, 2] - expected).max() < 1e-9
 
 
-def test_a_bag_of_what_is_measured_has_the_true_states_beside_it(fmus, tmp_path):
+def test_a_bag_of_measured_states_also_has_the_true_ones(fmus, tmp_path):
     settings = {"control_period": 0.01, "x_des": (0.15, 0.1), **SEEN, **EXACT}
     fmu, storages = fmus("twodof", "task", "fmi2"), {"mcap": read_topics_of_mcap, "sqlite3": read_topics_of_sqlite3}
     samples = list(twodof.samples(fmu, stop_time=0.3, settings=settings))

@@ -111,7 +111,7 @@ def test_port_that_another_is_about_to_serve():
 
 
 @pytest.mark.parametrize("method", ["HEAD", "POST", "DELETE"])
-def test_what_a_page_is_not_asked_for_is_answered(method):
+def test_unexpected_requests_of_a_page_are_answered(method):
     """Methods other than GET get status 405, for example with curl -I."""
     with Server(b"page", port=0) as server:
         asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)

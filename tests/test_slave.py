@@ -229,7 +229,7 @@ def refused(driver, data, message):
 
 
 @in_child_process
-def test_a_state_from_before_the_run_keeps_what_is_yet_to_be_refused(fmu_path):
+def test_a_state_from_before_the_run_keeps_pending_errors(fmu_path):
     driver = Driver(fmu_path)
     driver.set(rtol=-1.0)
     data = driver.call("serializeFMUstate", driver.call("getFMUstate"))
@@ -266,7 +266,7 @@ REFUSALS = {
 
 
 @in_child_process
-def test_what_is_refused_is_logged_keeps_the_state_and_discards_the_next_step(fmu_path):
+def test_a_refused_value_is_logged_keeps_the_state_and_discards_the_next_step(fmu_path):
     expected = Driver(fmu_path).initialise().run(20)
     driver = Driver(fmu_path).initialise()
     for k, (message, refuse) in enumerate(REFUSALS.items()):
@@ -458,14 +458,14 @@ CANNOT = (
 
 
 @in_child_process
-def test_what_this_flavour_cannot_do_is_as_documented(fmu_path, native_path):
+def test_the_limits_of_this_flavour_are_as_documented(fmu_path, native_path):
     """Each returns whether the feature works, and whether the documented effect occurs instead."""
     for row in CANNOT:
         assert row(native_path) == (True, False), row
         assert row(fmu_path) == (False, True), row
 
 
-def test_what_this_flavour_cannot_do_is_told_row_by_row(fmu_path, native_path):
+def test_the_limits_of_this_flavour_are_listed_row_by_row(fmu_path, native_path):
     rows = []
     for fmu in (fmu_path, native_path):
         with zipfile.ZipFile(fmu) as archive:
@@ -523,7 +523,7 @@ def test_a_linked_environment_is_found_without_any_variable(linked, tmp_path):
     assert ("Failed to instantiate" in host.stderr) == (not linked)
 
 
-def test_requirements_name_what_the_plant_imports(fmu_path):
+def test_requirements_name_the_imports_of_the_plant(fmu_path):
     with zipfile.ZipFile(fmu_path) as archive:
         requirements = archive.read("resources/requirements.txt").decode().split()
         config = json.loads(archive.read("resources/plant.json"))

@@ -67,7 +67,7 @@ def evaluations(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> int:
     return count[0]
 
 
-def test_coefficients_satisfy_the_order_conditions_of_a_w_method_and_damp_what_is_stiff():
+def test_coefficients_satisfy_the_order_conditions_of_a_w_method_and_damp_stiff_modes():
     """Hairer & Wanner, "Solving ODEs II", IV.7: orders 3 and 2 with any T; R(∞) = 0."""
     g = rosenbrock.GAMMA
     lower = np.zeros((4, 4))

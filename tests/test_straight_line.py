@@ -17,7 +17,7 @@ from twodof.plant.robot import load_robot
 from twodof.plant.variables import variable_table
 
 
-def test_what_constants_make_0_or_1_leaves_no_operation():
+def test_factors_that_are_constantly_0_or_1_leave_no_operation():
     x, y = Expression("x"), Expression("y")
     assert 0.0 * x + 1.0 * y is y
     assert x - 0.0 is x and 0.0 / x == 0.0

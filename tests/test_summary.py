@@ -76,7 +76,7 @@ def test_summary_is_that_of_the_mcap_project(bag):
     assert len(ours.chunks) > 2
 
 
-def test_a_summary_says_what_reading_all_does(bag):
+def test_a_summary_equals_a_full_read(bag):
     by_summary = ends(bag)
     without_checksum(file_of(bag))
     assert read_summary(file_of(bag)) is None

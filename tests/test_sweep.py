@@ -117,7 +117,7 @@ def test_time_at_limits_is_that_of_the_samples(native_path):
     assert row["time_at_limits"] == pytest.approx(at_limit * STEP)
 
 
-def test_what_is_not_defined_is_null(native_path):
+def test_undefined_metrics_are_null(native_path):
     at_rest = {"x_des": tuple(oracles.position(Q0))}
     (row,) = sweep(native_path, grid={"Kp": [50.0]}, settings=at_rest).to_dict("records")
     assert np.isnan(row["settling_time"]) and np.isnan(row["overshoot"])

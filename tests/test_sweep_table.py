@@ -68,7 +68,7 @@ def undisturbed(native_path, tmp_path_factory):
 
 
 @pytest.mark.long
-def test_what_is_interrupted_is_resumed(native_path, undisturbed, tmp_path, length):
+def test_an_interrupted_sweep_is_resumed(native_path, undisturbed, tmp_path, length):
     """The interrupt is Ctrl-C to all processes of the terminal, or the death of the sweep's own process."""
     rng = random.Random(3)
     expected = table_of(undisturbed)
@@ -123,7 +123,7 @@ def test_resuming_repeats_nothing(native_path, tmp_path):
     assert {file.name: file.read_bytes() for file in path.iterdir()} == made
 
 
-def test_what_is_another_sweep_is_not_resumed(native_path, tmp_path, fmu_path):
+def test_another_sweep_is_not_resumed(native_path, tmp_path, fmu_path):
     path = tmp_path / "s"
     options: dict[str, Any] = {"grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True}
     sweep(native_path, **{**options, "resume": False})

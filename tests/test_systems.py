@@ -491,7 +491,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
 @pytest.mark.parametrize(
     ("structure", "files", "message"), [row[1:] for row in refusals()], ids=[row[0] for row in refusals()]
 )
-def test_what_a_system_cannot_be_is_refused_at_once(
+def test_invalid_systems_are_refused_at_once(
     plant: bytes, pd: bytes, tmp_path: Path, structure: bytes | None, files: dict[str, bytes], message: str
 ) -> None:
     system = loop(tmp_path / "bad.ssp", plant, pd, structure, **files)
@@ -522,7 +522,7 @@ def test_a_refused_step_names_its_component(plant: bytes, pd: bytes, tmp_path: P
         twodof.simulate(system, step=H, stop_time=N * H, settings={"pd.Kp": 1e300, "pd.q_des": 1e300})
 
 
-def test_what_an_fmu_alone_has_is_refused_of_a_system(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+def test_options_of_a_single_fmu_are_refused_for_a_system(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     system = loop(tmp_path / "loop.ssp", plant, pd)
     with pytest.raises(InputError, match="is a system"):
         twodof.linearise(system)

@@ -64,7 +64,7 @@ def test_a_deviation_is_named_with_its_time(runs):
         assert_equal(pushed, good, within=1e-5)
 
 
-def test_what_cannot_be_compared_fails(runs):
+def test_incomparable_bags_fail(runs):
     """A run without limits, a target or equal samples fails the assertion."""
     good = twodof.read_bag(runs["good"])
     unknown = dataclasses.replace(good, provenance={})

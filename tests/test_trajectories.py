@@ -94,7 +94,7 @@ def spline(times: Sequence[float], points: Sequence[Any]) -> BPoly:
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_what_is_held_is_the_mean_of_a_spline(arm, tmp_path, parts):
+def test_the_held_value_is_the_mean_of_a_spline(arm, tmp_path, parts):
     """It goes from rest, through three points between communication points, to rest."""
     knots = [0.0, 0.333, 0.7, 1.111]
     numbers = np.random.default_rng(parts).normal(size=(4, 3, 2))
@@ -117,7 +117,7 @@ def test_what_is_held_is_the_mean_of_a_spline(arm, tmp_path, parts):
     np.testing.assert_array_equal(table[-1], [numbers[-1, 0], (0, 0), (0, 0)])  # held to the bit
 
 
-def test_the_robot_does_exactly_what_is_held(arm, tmp_path):
+def test_the_robot_follows_exactly_the_held_inputs(arm, tmp_path):
     """It starts off the trajectory; in each step ë + Kd ė + Kp e = c with constant c."""
     bag = write(tmp_path / "bag", (0.0, trajectory([(0.0, *THERE), (1.0, *BACK), (1.5, *THERE)])))
     out, h = tmp_path / "model", 0.01
@@ -247,7 +247,7 @@ NAN = float("nan")
         (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp must be 0"),
     ],
 )
-def test_what_cannot_be_followed(arm, tmp_path, capfd, message, reason):
+def test_messages_that_cannot_be_followed(arm, tmp_path, capfd, message, reason):
     bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *THERE)])), (0.5, message))
     assert main(["run", str(arm), "--input", f"{bag}:/go", "-o", str(tmp_path / "none")]) == 1
     (line,) = capfd.readouterr().err.splitlines()
@@ -263,7 +263,7 @@ def test_what_cannot_be_followed(arm, tmp_path, capfd, message, reason):
         (1e-9, ((1e300, 0.0), (0.0, 0.0), (0.0, 0.0)), "0.01", "is not finite"),
     ],
 )
-def test_what_would_have_no_end(arm, tmp_path, capfd, after, there, step, reason):
+def test_runs_that_would_have_no_end(arm, tmp_path, capfd, after, there, step, reason):
     bag = write(tmp_path / "bag", (0.0, trajectory([(after, *there)])))
     given = ["--input", str(bag), "--step", step, "-o", str(tmp_path / "none")]
     assert main(["run", str(arm), *given]) == 1

@@ -65,7 +65,7 @@ MIMIC = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
 <mimic joint="j" multiplier="{factor}" offset="0.1"/></joint></robot>"""
 
 
-def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
+def test_the_mimic_of_a_locked_joint_is_locked_at_the_matching_position() -> None:
     joints = read_urdf(lock_joints(MIMIC.format(factor=0.5), {"j": 0.4})).joints
     assert {joint.type for joint in joints.values()} == {"fixed"}
     assert joints["j"].rpy == pytest.approx((0, 0, 0.4), abs=1e-15)
