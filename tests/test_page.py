@@ -651,7 +651,7 @@ def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:
     ("old", "new", "reason"),
     [
         (rb'rgba="[^"]*"', b'rgba="1 nan 1 1"', "cannot be shown: link 'link1' cannot be drawn: rgba='1 nan"),
-        (rb"\baccepts\b", b"takes", "another version of twodof built it, .*; build it again"),
+        (rb"\baccepts\b", b"takes", "its C sources are not those of this version of twodof, .*; build it again"),
     ],
 )
 def test_an_fmu_that_no_page_can_show_is_named(native_path, tmp_path, old, new, reason) -> None:

@@ -117,7 +117,7 @@ def page_of(run: Experiment) -> bytes:
         own = engine_sources(fmu.control, fmu.version).items()
         if sources.items() >= own or not compiles_for_the_web():
             raise
-        reason = "another version of twodof built it, and its C sources do not fit the page of this one"
+        reason = "its C sources are not those of this version of twodof, and do not compile for a page"
         raise PageError(f"'{fmu.path}': {reason}; build it again") from error
     provenance = provenance_of(run, "")
     provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses only this package
