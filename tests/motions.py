@@ -38,6 +38,8 @@ def mujoco_model(
     model.dof_frictionloss[:], model.dof_solref[:, 0] = dof.get("friction", 0.0), 1e-3
     model.dof_damping[:], model.dof_armature[:] = dof.get("damping", 0.0), dof.get("armature", 0.0)
     model.jnt_stiffness[:], model.jnt_limited[:] = dof.get("stiffness", 0.0), 0
+    # friction yields in proportion to the compiled inverse inertia, which does not include the armature
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 

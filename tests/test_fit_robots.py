@@ -17,12 +17,15 @@ from twodof.plant.robot import load_robot
 
 UR5 = robots_folder() / "ur_description" / "urdf" / "ur5_robot.urdf"
 PANDA = robots_folder() / "panda_description" / "urdf" / "panda.urdf"
+XARM7 = robots_folder() / "xarm_description" / "urdf" / "xarm7.urdf"
 # URDF, end effector, home, locked joints; friction, damping and armature of the joints
 ARMS: dict[str, tuple[Path, str, list[float], dict[str, float], list[list[float]]]] = {
     "UR5": (UR5, "tool0", [0, -1.2, 1.2, -0.5, 0.3, 0], {},
         [[6, 8, 4, 1.5, 1, 1], [4, 5, 3, 0.5, 0.4, 0.3], [0.6, 0.6, 0.4, 0.1, 0.1, 0.1]]),
     "Panda": (PANDA, "panda_hand_tcp", [0, -0.6, 0, -1.9, 0, 1.6, 0.7], {"panda_finger_joint*": 0.0},
         [[2.5, 3, 2, 2, 1, 1, 0.8], [1.5, 1.5, 1, 1, 0.4, 0.4, 0.3], [0.3, 0.3, 0.2, 0.2, 0.08, 0.08, 0.05]]),
+    "xArm7": (XARM7, "link7", [0, -0.3, 0, 0.9, 0, 1, 0], {},
+        [[4, 5, 3, 3, 1.5, 1, 0.8], [3, 3, 2, 2, 0.8, 0.5, 0.4], [0.5, 0.5, 0.3, 0.3, 0.08, 0.08, 0.05]]),
 }  # fmt: skip
 
 
