@@ -90,7 +90,7 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
     """Return the engine's C files with one control law and the functions of one FMI version."""
     law = "task" if control == "pose" else control
     left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
-    left_out |= set() if law == "task" else {"pseudo_inverse.c"}
+    left_out |= set() if law == "task" else {"pseudo_inverse.c", "task_slopes.c"}
     left_out |= set() if control == "pose" else {"orientation.c"}
     left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c", "clock.c"}
     return {
