@@ -106,7 +106,7 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
         ({"x_des": (0.5, 0.1)}, "note: the arm is near a singularity"),
         ({"x_des": (0.5, 0.1), "Kd": 1.0}, "also Kd[1] = 1 s⁻¹ damps Kp[1] = 50 s⁻² too little"),
         ({"x_des": (0.5, 0.1)}, "with Kp = 50, Kd = 40"),
-        ({"x_des": (0.5, 0.1)}, "not within 2 % of the first error, 0.282 m"),
+        ({"x_des": (0.5, 0.1)}, "not within 2 % of the first error of 0.282 m"),
         ({"x_des": (0.5, 0.1), "Kp": (900.0, 100.0)}, "with Kp = (900, 100), Kd = 40"),
         ({"payload": 0.35, "Kd": 1.0, "x_des": (0.2354, 0.1774)}, " times the way, RMS error"),
         ({"Kp": 0.5}, "joint 'joint2' still moving at"),
@@ -406,6 +406,17 @@ def test_a_judge_of_nothing_has_no_number() -> None:
         twodof.verdict([], run)
     with pytest.raises(twodof.TwoDofError, match="experiment"):
         twodof.verdict([])
+
+
+@pytest.mark.parametrize(("target", "sticks"), [(0.8, False), (0.55, True)])
+def test_a_joint_that_is_pressed_onto_its_limit_does_not_stick(target: float, sticks: bool) -> None:
+    """It sticks there if friction, and not the limit, holds it."""
+    settings = {"q_des": (0.5, target), "q_max": (1.0, 0.6), "q_start": (0.5, 0.6), "friction": (0.0, 1.0)}
+    kept = Kept()
+    causes = twodof.simulate(fmu_of("arm", "joint"), kept, settings=settings, stop_time=3.0).verdict.causes
+    assert kept.samples[-1].q[1] == 0.6
+    assert ("friction" in {c.kind for c in causes}) is sticks
+    assert ("friction" in {c["kind"] for c in page_causes(kept.run, kept.samples)}) is sticks
 
 
 def test_a_joint_sticks_from_its_last_motion_on() -> None:

@@ -180,8 +180,9 @@ export class Verdict {
   }
 
   friction() {
-    const { session } = this;
+    const { session } = this, stopped = this.robot.stopped(session.now), driven = stopped.length ? this.driven() : [];
     return session.held("friction").flatMap((size, i) => {
+      if (stopped.includes(this.joints[i]) && !driven[i]) return [];
       const [still, late] = size > 0 ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
       const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
       return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still)] : [];

@@ -190,11 +190,14 @@ def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup = judge.setup
     friction, v = setup.given("friction"), np.abs(judge.end("v"))
     own = {name: joint.friction for name, joint in (setup.robot.joints if setup.robot else {}).items()}
+    q, driven = judge.end("q"), _driven(judge)
+    at_limit = np.minimum(np.abs(q - setup.low), np.abs(q - setup.high)) <= AT_LIMIT
+    pressed = {i for i, joint in enumerate(setup.joints) if at_limit[i] and joint not in driven}
     for i, joint in enumerate(setup.joints[: len(friction)]):
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > FLOOR if judge.wanted("q").size else bool(missed)
         moved = max(0.0, float(judge.moved[i]))
         held = judge.duration - moved > OFTEN * judge.duration
-        if friction[i] > 0.0 and off and (held or v[i] <= CREEPING * judge.speed[i]):
+        if friction[i] > 0.0 and off and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i]):
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"
             text += "; raise Kp" * bool(judge.aims and friction[i] <= own.get(joint, 0.0))

@@ -42,10 +42,11 @@ def load(judge: Judge) -> Iterator[Cause]:
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
     each = heavy or [name for name in usual if usual[name] > 0.0]
-    which = "all joints" if len(each) == len(usual) > 2 else f"joints {', '.join(map(repr, each))}"
+    known = f"does not know the damping of joints {', '.join(map(repr, each))}"
+    known = "knows the damping of no joint" if len(each) == len(usual) > 2 else known
     kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.0)
     if each:
-        yield Cause(kind, f"the controller does not know the damping of {which}{tail}", share)
+        yield Cause(kind, f"the controller {known}{tail}", share)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
         if values.any():

@@ -89,7 +89,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
         firsts = [f"{aim.first:.3g} {UNITS.get(name, 'rad')}" for name, aim in judge.aims.items()]
-        late = f"not within 2 % of the first error, {' and '.join(firsts)}"
+        late = f"not within 2 % of the first error of {' and '.join(firsts)}"
         parts.append(late if settling == inf else f"within 2 % after {settling:.4g} s")
         if "overshoot" in numbers:
             past = numbers["overshoot"]
