@@ -124,7 +124,7 @@ def test_a_controller_in_real_time_misses_nothing(bare, tmp_path, number, listen
     fmu, steps = bare(7), 100 * length(60, 4)
     node = listen("/joint_states", *control(7))
     bag = tmp_path / "bag"
-    options = ["--stop-time", str(steps / 100), "-o", str(bag)]
+    options = ["--stop-time", str(steps / 100), "--timeout", "10", "-o", str(bag)]  # of a busy machine
     with published(number, fmu, *options) as process:
         _, err = ended(process)
     assert err == ""
