@@ -18,12 +18,12 @@ typedef struct {
 /* The holds in a communication step. Times are in s from its start. */
 typedef struct {
     int rigid;
-    double chatter_time, first;               /* the latter a fraction, for joints */
-    double left[N_JOINTS], slipped[N_JOINTS]; /* last release and start of slip of each joint */
-    double risen, risen_v[N_JOINTS];          /* last rise of the rank, and the velocities then */
+    double chatter_time, first;               /* first: first hold of joints, a fraction of the longest */
+    double left[N_JOINTS], slipped[N_JOINTS]; /* times of each joint's last release and start of slip */
+    double risen, risen_v[N_JOINTS];          /* time of the rank's last rise, and velocities at that time */
     Hold joints, rank, stuck[N_JOINTS];
     int chattering[N_JOINTS], joints_held[N_JOINTS];
-    double soon, longest;                     /* limits of the next hold of joints, as in hold_for_a_while */
+    double soon, longest;                     /* arguments of hold_for_a_while for the next hold of joints */
 } AntiChatter;
 
 static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
@@ -41,7 +41,7 @@ static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
     }
 }
 
-/* Begin a hold at t, longer than the last one if that ended less than `soon` ago. */
+/* Begin a hold at t. It is longer than the last one if that ended less than `soon` ago. */
 static void hold_for_a_while(Hold *hold, double t, double soon, double longest, double first)
 {
     const int again = t - hold->until < soon;
@@ -49,8 +49,8 @@ static void hold_for_a_while(Hold *hold, double t, double soon, double longest, 
     hold->until = t + hold->length;
 }
 
-/* The longest hold within the tolerance of a joint, if a hold of the length `passed` has the given error. The error
-   grows with the square of time. */
+/* Return the longest hold, at most `longest`, whose error at joint i is within the tolerance. A hold of the length
+   `passed` has the given error; the error grows with the square of the length. */
 static double bounded(double longest, const Step *step, int i, double error, double passed)
 {
     const double *value = step->plant->value;
@@ -64,8 +64,8 @@ static int is_at_limit(const Step *step, int i)
     return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
 }
 
-/* Hold the joints that chatter at t, and find those that stay at rest. A long hold covers all joints at limits. Returns
-   the end of the first hold, at most h. */
+/* Hold the joints that chatter at t, and set `kept` for all joints that are held. A hold of HOLD_OF_ALL or longer
+   covers all joints at limits. Return the time at which the first hold ends, at most h. */
 static double hold_joints(AntiChatter *chatter, const Step *step, double t, double h, int kept[N_JOINTS])
 {
     double end = chatter->rank.until > t ? fmin(h, chatter->rank.until) : h;
@@ -100,8 +100,8 @@ static void find_departures(AntiChatter *chatter, const Step *step, double t)
     chatter->longest = chatter->chatter_time;
 }
 
-/* True if the rank drops at t so soon after a rise that it is held: the effect of the higher rank is within the
-   tolerances. */
+/* Record a rise of the rank at t. If the rank drops at t, and the effect of the higher rank since its rise is within
+   the tolerances, hold the lower rank and return 1. */
 static int changes_back(AntiChatter *chatter, const Step *step, int before, double t)
 {
     const double passed = t - chatter->risen, *v = step->y + N_JOINTS;
@@ -121,7 +121,8 @@ static int changes_back(AntiChatter *chatter, const Step *step, int before, doub
     return passed < longest;
 }
 
-/* Find the joints that chatter after an event at t, and hold those that friction has stopped. */
+/* Set `chattering` for the joints that return to a limit soon after they left it, and hold each joint that friction
+   stops at once after its release. */
 static void find_chatter(AntiChatter *chatter, const Step *step, const Event *event, double t)
 {
     for (int i = 0; i < N_JOINTS; i++) {
@@ -132,7 +133,7 @@ static void find_chatter(AntiChatter *chatter, const Step *step, const Event *ev
         chatter->chattering[i] = event->stopped[i] && passed < hold;
         if (chatter->chattering[i]) {
             chatter->longest = fmin(chatter->longest, hold);
-            if (!(passed < FIRST_HOLD * chatter->chatter_time)) /* or rounding ended the excursion */
+            if (!(passed < FIRST_HOLD * chatter->chatter_time)) /* rounding ends a shorter excursion */
                 chatter->soon = fmax(chatter->soon, hold);
         }
         if (event->arrested[i] && t - chatter->slipped[i] < FIRST_HOLD * chatter->chatter_time)

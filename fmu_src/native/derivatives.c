@@ -1,6 +1,6 @@
-/* Directional and adjoint derivatives. The first direction at a point costs one complex evaluation; with the second one
-   the Jacobian of the accelerations is computed, of which further directions are products. Where the last point had
-   several directions, the next one's Jacobian is computed at once. */
+/* Directional and adjoint derivatives. The first direction at a point costs one complex evaluation. The second
+   direction at the same point computes the Jacobian of the accelerations; each further direction is a product with it.
+   If the previous point had several directions, the first direction already computes the Jacobian. */
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
@@ -13,8 +13,8 @@ typedef struct {
     Call call;
     const Reference *unknown, *given;
     size_t n_unknown, n_given;
-    int wants; /* computed variables that `differentiate` returns */
-    int by_product; /* the derivatives of the rates are elements of the Jacobian */
+    int wants; /* flags of the variables that `differentiate` computes */
+    int by_product; /* 1: the derivatives of the rates are products with the Jacobian */
 } Request;
 
 /* Name of the first variable whose value is not finite, or NULL. */
@@ -27,8 +27,8 @@ static const char *culprit(const Reference vr[], size_t count, const double valu
     return NULL;
 }
 
-/* The computed variables that the derivatives of the unknowns need; -1, with a logged reason, if there are no such
-   derivatives. */
+/* Return the flags of the variables that the request differentiates. If a variable has no derivative, log its name and
+   return -1. */
 static int wanted(Instance *instance, const Request *request)
 {
     int wants = 0;
@@ -51,8 +51,9 @@ static int wanted(Instance *instance, const Request *request)
     return wants;
 }
 
-/* True if the derivatives of the rates are elements of the Jacobian, which is computed if it is worth it, or if there
-   are reactions. */
+/* Return nonzero if the request's derivatives of the rates are products with the Jacobian, and compute the Jacobian if
+   necessary: for several directions, and for joints with reactions, which `differentiate` does not consider. Without
+   reactions the Jacobian does not contain the columns of the control law's inputs. */
 static int has_slopes(Instance *instance, int several, const Request *request)
 {
     State *state = &instance->state;
@@ -73,8 +74,8 @@ static int has_slopes(Instance *instance, int several, const Request *request)
     return state->has_rates & SLOPES;
 }
 
-/* Check a request and the values of its variables, one of which is the seed, and bring the state up to date. NULL, with
-   a logged reason, if there are no such derivatives or the seed is not finite. */
+/* Check a request and its seed, and update the state. If a variable has no derivative or the seed is not finite, log
+   the reason and return NULL. */
 static Instance *prepare(void *component, Request *request, const double of_unknown[], size_t n_of_unknown,
                          const double of_given[], size_t n_of_given)
 {
@@ -106,7 +107,7 @@ static Instance *prepare(void *component, Request *request, const double of_unkn
     return instance;
 }
 
-/* The change of the unknowns if the knowns (states and inputs) change by the seed. */
+/* Compute the change of the unknowns for the seed, a change of the knowns (states and inputs). */
 static Status directional_derivative(void *component, const Reference unknown[], size_t n_unknown,
                                      const Reference given[], size_t n_given, const double seed[],
                                      size_t n_seed, double result[], size_t n_result)
@@ -146,7 +147,7 @@ static Status directional_derivative(void *component, const Reference unknown[],
 }
 
 #if FMI == 3
-/* The change of the unknowns, weighted by the seed, for a change of each given variable by 1. */
+/* Compute, for each known, the sum of its derivatives of the unknowns, weighted by the seed. */
 Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size_t n_unknown,
                                 const Reference given[], size_t n_given, const double seed[],
                                 size_t n_seed, double result[], size_t n_result)
@@ -160,7 +161,7 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
     for (size_t i = 0; i < n_unknown; i++)
         for (int k = INDEX[unknown[i]]; k < INDEX[unknown[i] + 1]; k++)
             weight[k] += *seed++;
-    for (size_t i = 0; i < n_given; i++) /* a column of the Jacobian for each value */
+    for (size_t i = 0; i < n_given; i++) /* each value of a known is one column of the Jacobian */
         for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++) {
             double change[X] = {0}, derivative[FIRST_PARAMETER];
             change[k] = 1.0;
