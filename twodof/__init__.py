@@ -1,4 +1,4 @@
-"""From a URDF to an FMU that every FMI tool loads, and from a co-simulation to a ROS 2 bag.
+"""From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.
 
     import twodof
 
