@@ -40,7 +40,7 @@ def kept(tmp_path, monkeypatch):
     """The cache folder, empty except for the C library of zig."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
     cache = tmp_path / "cache"
-    cache.mkdir()
+    cache.mkdir(mode=0o700)  # independent of the umask, because a cache that others may write is not used
     for name in ("b", "h", "o", "tmp", "z"):
         (home / name).mkdir(parents=True, exist_ok=True)
         (cache / name).symlink_to(home / name)
