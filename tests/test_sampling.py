@@ -31,7 +31,7 @@ from twodof.plant.plant import Plant
 from twodof.plant.robot import load_robot
 from twodof.plant.sampling import rounded
 from twodof.plant.variables import variable_table
-from twodof.simulation.sampled_loop import spectral_radius
+from twodof.simulation.sampled_loop import spectral_radius, stable_gains
 
 SLIDER = """<robot name="slider">
   <link name="rail"/>
@@ -93,6 +93,22 @@ def test_a_sampled_joint_is_stable_up_to_its_closed_form(Kp, Kd, stable):
     for _ in range(2500):
         plant.step(0.01)
     assert (abs(plant.q[0]) + abs(plant.v[0]) < 0.1) == stable
+
+
+@pytest.mark.parametrize(("Kp", "Kd"), [(1000.0, 1000.0), (90000.0, 300.0), (1e9, 1e5)])
+def test_the_largest_stable_gains_are_those_of_the_closed_form(Kp, Kd):
+    """Kp T/2 < Kd < 2/T, for gains Kp c² and Kd c of the same damping ratio."""
+    scale = min(2.0 / 0.01 / Kd, 2.0 * Kd / (Kp * 0.01))
+    assert stable_gains(Kp, Kd, 0.01, 0.0) == pytest.approx((Kp * scale**2, Kd * scale), rel=1e-3)
+
+
+def test_the_largest_stable_gains_of_a_late_controller_have_no_phase_margin():
+    """A continuous loop with a delay is stable while, where |L| = 1, atan(ω Kd/Kp) exceeds ω times the delay."""
+    delay = 0.05
+    Kp, Kd = stable_gains(900.0, 60.0, 1e-3, delay)
+    crossing = np.sqrt((Kd**2 + np.sqrt(Kd**4 + 4.0 * Kp**2)) / 2.0)
+    assert np.arctan(crossing * Kd / Kp) == pytest.approx(crossing * (delay + 0.5e-3), rel=1e-3)
+    assert stable_gains(900.0, 0.0, 0.01, 0.0) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("differences", [False, True])

@@ -28,9 +28,11 @@ from twodof.simulation.cause import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
 from twodof.simulation.setup import robot_of
-from twodof.simulation.verdict_text import _also
+from twodof.simulation.verdict_text import _grouped
 
 STEP = 0.001
+LATE = {"control_period": 0.005, "control_delay": 0.0489, "Kp": 342.0, "Kd": 30.8, "x_des": (-0.107, 0.2)}
+NOISY = {"q_noise": 0.01, "control_period": 0.02, "Kd": 60.0, "x_des": (0.2, 0.2)}
 
 
 class Kept(twodof.Sink):
@@ -104,12 +106,16 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
     ("settings", "line"),
     [
         ({"x_des": (0.5, 0.1)}, "note: the arm is near a singularity"),
-        ({"x_des": (0.5, 0.1), "Kd": 1.0}, "also Kd[1] = 1 s⁻¹ damps Kp[1] = 50 s⁻² too little"),
+        ({"x_des": (0.5, 0.1), "Kd": 1.0}, "also Kd = 1 s⁻¹ damps Kp = 50 s⁻² too little"),
         ({"x_des": (0.5, 0.1)}, "with Kp = 50, Kd = 40"),
         ({"x_des": (0.5, 0.1)}, "not within 2 % of the first error of 0.282 m"),
         ({"x_des": (0.5, 0.1), "Kp": (900.0, 100.0)}, "with Kp = (900, 100), Kd = 40"),
-        ({"payload": 0.35, "Kd": 1.0, "x_des": (0.2354, 0.1774)}, " times the way, RMS error"),
+        ({"payload": 0.35, "Kd": 1.0, "x_des": (0.2354, 0.1774)}, ", the target is passed by 0.315 m, RMS error"),
         ({"Kp": 0.5}, "joint 'joint2' still moving at"),
+        ({"Kp": 1000.0, "Kd": 5.0, "x_des": (-0.107, 0.4107)}, "beyond the URDF's limit of 10 N·m; likewise 'joint2'"),
+        (LATE, "it is stable below Kp = 189, Kd = 22.9"),
+        ({**NOISY, "Kp": 900.0}, "joint 'joint1' reverses every 0.034 s: the gains (Kp up to 900) are too high for"),
+        ({**NOISY, "Kp": (900.0, 0.0)}, "Kp[2] (along y) = 0: the controller does not reduce the error there"),
         ({"q_max": (0.6, 0.4)}, "at rest with 'joint1', 'joint2' at their limits"),
         ({"payload": 2.0, "limit_effort": True}, "payload = 2 kg, limit_effort = true"),
     ],
@@ -118,6 +124,27 @@ def test_a_failed_run_has_a_line(settings: dict[str, Any], line: str) -> None:
     lines = twodof.simulate(fmu_of("arm", "task"), settings={**settings, **failures.LARGE_STEPS}).verdict.lines
     assert any(line in each for each in lines), "\n".join(lines)
     assert not re.search(r"\d{4}\S* %|e\+\d+ %", "".join(lines))  # no percentage is large
+
+
+@pytest.mark.parametrize(
+    ("robot", "control", "settings", "text"),
+    [
+        ("arm", "task", LATE, "note:"),  # consequences of an unstable loop
+        ("arm", "task", {**NOISY, "Kp": 900.0}, " Hz"),  # of a joint that reverses with the samples
+        ("panda", "pose", {"Kp": (50.0, 50.0, 0.0), "x_des": (0.36, -0.05, 0.45)}, "damping of any joint"),  # at rest
+        ("arm", "joint", {"friction": (0.3, 0.1), "q_des": (1.2, 0.1), "Kd": 200.0}, "still approach"),  # it sticks
+        ("ur5", "joint", {"payload": 40.0, "payload_known": True, "limit_effort": True}, "peak effort"),  # saturated
+    ],
+)
+def test_a_failed_run_has_no_line(robot: str, control: str, settings: dict[str, Any], text: str) -> None:
+    lines = twodof.simulate(fmu_of(robot, control), settings={**settings, **failures.LARGE_STEPS}).verdict.lines
+    assert lines[0].startswith("not reached") and not any(text in line for line in lines), "\n".join(lines)
+
+
+def test_a_run_that_starts_at_its_target_says_so() -> None:
+    settings = {"payload": 1.0, "q_des": (0.5, 0.3), "q_start": (0.5, 0.3)}
+    lines = twodof.simulate(fmu_of("arm", "joint"), settings=settings).verdict.lines
+    assert any(line.startswith("the run starts at its target, ") for line in lines), "\n".join(lines)
 
 
 def test_a_reached_target_needs_no_settings() -> None:
@@ -146,7 +173,8 @@ def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:
 
 def test_a_line_names_each_joint_once() -> None:
     stands = [Cause("limit", f"joint '{name}' stood", joint=name) for name in ("a", "b", "a", "c", "b")]
-    assert _also((Cause("gain", "a gain"), *stands)) == ["", "also joint 'a' stood; likewise 'b', 'c'"]
+    texts = [cause.text for cause in _grouped((Cause("gain", "a gain"), *stands))]
+    assert texts == ["a gain", "joint 'a' stood; likewise 'b', 'c'"]
 
 
 def test_a_bag_a_figure_and_a_page_say_the_same(

@@ -22,6 +22,7 @@ const FEWEST = 0.2; // damping ratio below which the damping is insufficient
 const TAIL = 256, FAST = 0.25; // examined last samples, and reversals in the time of a step that are too many
 const MOTION = ["effort", "velocity"], FOLLOWING = ["limit", "saturation", "singularity"], EXPLAINED = 0.1; // as in causes.py
 const UNSTABLE = 1 + 1e-4; // spectral radius
+const DRAG = 0.02; // effort of damping, relative to the largest effort, that counts
 const GAINS = [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]]; // of position or joints, and of orientation
 
 export class Verdict {
@@ -43,9 +44,21 @@ export class Verdict {
     if (!root) return [];
     if (!this.session.follows) return [root, ...others].map(({ text }) => text);
     if (!this.missed().includes(true)) return [`reached; but ${root.text}`];
+    const [first, ...rest] = this.grouped([root, ...others]), runaway = root.kind === "unstable";
     /** @type {(noted: boolean, word: string) => string[]} */
-    const rest = (noted, word) => others.filter((other) => other.noted === noted).map(({ text }) => `${word} ${text}`);
-    return [`not reached: ${root.text}`, ...rest(false, "also"), ...rest(true, "note:")].slice(0, 3);
+    const named = (noted, word) => rest.filter((other) => other.noted === noted).map(({ text }) => `${word} ${text}`);
+    return [`not reached: ${first.text}`, ...named(false, "also"), ...(runaway ? [] : named(true, "note:"))].slice(0, 3);
+  }
+
+  /** The worst cause of each kind with the joints of its others, and all causes without a joint. */
+  /** @type {(causes: Cause[]) => Cause[]} */
+  grouped(causes) {
+    return causes.flatMap((each) => {
+      const same = causes.filter(({ kind, noted, joint }) => joint >= 0 && kind === each.kind && noted === each.noted);
+      if (each.joint < 0) return [each];
+      const names = same.slice(1).map(({ joint }) => `'${this.joints[joint].name}'`).join(", ");
+      return each === same[0] ? [{ ...each, text: each.text + (names && `; likewise ${names}`) }] : [];
+    });
   }
 
   /** @returns {Cause[]} Causes at the latest sample, the root first. */
@@ -62,8 +75,9 @@ export class Verdict {
     const waited = session.time(last) - session.time(this.began) >= SETTLE;
     if (missed.includes(true)) found.push(...this.reach(missed[0], waited), ...this.gains(missed), ...this.atLimits());
     if (missed.includes(true) && waited) {
-      found.push(...this.loads(), ...this.friction(), ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
-      found.push(...this.damping(missed), ...this.singular(), ...this.slow(missed));
+      const sticking = this.friction(); // the rate of an error tells nothing while a joint sticks
+      found.push(...this.loads(), ...sticking, ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
+      found.push(...this.damping(missed), ...this.singular(), ...(sticking.length ? [] : this.slow(missed)));
     }
     return this.ranked(found);
   }
@@ -78,7 +92,7 @@ export class Verdict {
     /** @type {(cause: Cause) => number} */
     const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind);
     const [root, ...others] = found.sort((a, b) => rank(a) - rank(b) || b.share - a.share), [error] = this.errors(this.session.count - 1);
-    const leads = ["degrees", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
+    const leads = ["degrees", "unstable", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
     for (const each of others) each.noted = passing(each) || MOTION.includes(each.kind) || (leads && FOLLOWING.includes(each.kind));
     const stands = others.some(({ kind, noted }) => kind === "limit" && noted);
     for (const each of others) each.noted ||= stands && each.kind === "singularity";
@@ -155,11 +169,22 @@ export class Verdict {
     return [cause("reach", text, distance)];
   }
 
+  /** The name of element i of a gain, and its direction or joint, unless all elements are equal. */
+  /** @type {(group: string, i: number) => string} */
+  gain(group, i) {
+    const { session, joints } = this, values = session.held(group);
+    if (values.length > 1 && Math.max(...values) === Math.min(...values)) return group;
+    if (group.endsWith("_rot")) return `${group}[${i + 1}] (about ${"xyz"[i]})`;
+    const where = session.groups.has("x_des") ? `along ${"xyz"[session.axes[i]]}` : `of joint '${joints[i].name}'`;
+    return `${group}[${i + 1}] (${where})`;
+  }
+
   /** @type {(missed: boolean[]) => Cause[]} */
   gains(missed) {
     const zero = GAINS.flatMap(([stiff], k) =>
-      missed[k] ? this.session.held(stiff).flatMap((gain, i) => (gain === 0 ? [`${stiff}[${i + 1}]`] : [])) : []);
-    return zero.length ? [cause("gain", `${zero.join(", ")} = 0: the controller does not reduce this error`)] : [];
+      missed[k] ? this.session.held(stiff).flatMap((gain, i) => (gain === 0 ? [this.gain(stiff, i)] : [])) : []);
+    const text = `${[...new Set(zero)].join(", ")} = 0: the controller does not reduce the error there; raise the gain`;
+    return zero.length ? [cause("gain", text)] : [];
   }
 
   /** @type {(missed: boolean[]) => Cause[]} */
@@ -185,7 +210,7 @@ export class Verdict {
       if (stopped.includes(this.joints[i]) && !driven[i]) return [];
       const [still, late] = size > 0 ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
       const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
-      return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still)] : [];
+      return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still, i)] : [];
     });
   }
 
@@ -194,7 +219,7 @@ export class Verdict {
     return session.values.get("limit_effort") !== true ? [] : joints.flatMap(({ name, effort }, i) => {
       const shares = effort === null ? [0, 0] : this.shares((k) => Math.abs(session.value("tau", k, i)) >= effort * (1 - 1e-9));
       const text = `the motor of joint '${name}' is saturated for ${Math.round(100 * shares[0])} % of the time`;
-      return shares[0] > OFTEN && shares[1] > OFTEN ? [cause("saturation", text, shares[0])] : [];
+      return shares[0] > OFTEN && shares[1] > OFTEN ? [cause("saturation", text, shares[0], i)] : [];
     });
   }
 
@@ -204,7 +229,7 @@ export class Verdict {
       const limit = [joint.effort, joint.velocity][side] ?? Infinity, group = ["tau", "v"][side];
       const peak = Math.max(...this.picked().map((k) => Math.abs(this.session.value(group, k, i))));
       const text = `joint '${joint.name}' needs ${["an effort", "a speed"][side]} beyond the URDF's limit of ${short(limit)} ${side ? speedUnit(joint) : forceUnit(joint)}`;
-      return peak > limit * (1 + 1e-9) ? [cause(kind, text, peak / limit)] : [];
+      return peak > limit * (1 + 1e-9) ? [cause(kind, text, peak / limit, i)] : [];
     }));
   }
 
@@ -220,8 +245,16 @@ export class Verdict {
     const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
     const heavy = damped((size, i) => size > 2 * this.joints[i].damping), some = damped((size) => size > 0);
     if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 0.4));
-    else if (some.length) found.push(cause("drag", `${unknown} damping of joints ${some.join(", ")} in the URDF`));
+    else if (some.length && this.drags()) found.push(cause("drag", `${unknown} damping of joints ${some.join(", ")} in the URDF`));
     return found;
+  }
+
+  /** Whether the damping of a joint needs a part of the efforts in the last quarter. */
+  drags() {
+    const { session } = this, late = this.picked(0.25);
+    const most = (/** @type {string} */ group, /** @type {number[]} */ by) =>
+      Math.max(...late.flatMap((k) => by.map((factor, i) => factor * Math.abs(session.value(group, k, i)))));
+    return most("v", [...session.held("damping")]) > DRAG * most("tau", this.joints.map(() => 1));
   }
 
   /** A joint that reverses as fast as the controller's steps, or else gains of an unstable loop. */
@@ -249,7 +282,7 @@ export class Verdict {
     return GAINS.flatMap(([stiff, damp]) => {
       const Kd = session.held(damp), radii = session.held(stiff).map((p, i) => spectralRadius(p, Kd[i], period, delay, differences));
       const i = radii.indexOf(Math.max(...radii));
-      return radii[i] > UNSTABLE ? [cause("sampling", `${stiff}[${i + 1}] and ${damp}[${i + 1}] are too high for ${settings()}: the loop is unstable`)] : [];
+      return radii[i] > UNSTABLE ? [cause("unstable", `${this.gain(stiff, i)} and ${this.gain(damp, i)} are too high for ${settings()}: the loop is unstable`)] : [];
     });
   }
 
@@ -259,7 +292,7 @@ export class Verdict {
     return GAINS.flatMap(([stiff, damp], k) => {
       const Kd = session.held(damp), Kp = session.held(stiff), i = Kp.findIndex((p, n) => p > 0 && Kd[n] < FEWEST * 2 * Math.sqrt(p));
       if (!missed[k] || i < 0) return [];
-      return [cause("damping", `${damp}[${i + 1}] = ${short(Kd[i])} s⁻¹ damps too little: critical is ${short(2 * Math.sqrt(Kp[i]))} s⁻¹`)];
+      return [cause("damping", `${this.gain(damp, i)} = ${short(Kd[i])} s⁻¹ damps too little: critical is ${short(2 * Math.sqrt(Kp[i]))} s⁻¹`)];
     });
   }
 

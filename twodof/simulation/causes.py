@@ -37,7 +37,8 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     ill = bool(missed) or motion == "diverging"
     if missed:
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
-        found += [*_friction(judge, missed), *_singular(judge), *slow(judge, missed)]
+        sticking = [*_friction(judge, missed)]  # the rate of an error tells nothing while a joint sticks
+        found += [*sticking, *_singular(judge), *([] if sticking else slow(judge, missed))]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *sampled(judge)]
     if missed:
@@ -68,7 +69,7 @@ def _leads(root: Cause, cause: Cause, judge: Judge) -> bool:
         gap = np.linalg.norm(judge.wanted("x") - np.array(root.point)[judge.setup.rows])
         error = judge.aims["x" if np.isclose(gap, root.share) else "quat"].last
         return cause.kind in FOLLOWING and error - root.share <= EXPLAINED * root.share
-    return cause.kind in FOLLOWING and root.kind in ("degrees", "sampling")
+    return cause.kind in FOLLOWING and root.kind in ("degrees", "unstable", "sampling")
 
 
 def _degrees(judge: Judge) -> Iterator[Cause]:
@@ -189,7 +190,6 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
 def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup = judge.setup
     friction, v = setup.given("friction"), np.abs(judge.end("v"))
-    own = {name: joint.friction for name, joint in (setup.robot.joints if setup.robot else {}).items()}
     q, driven = judge.end("q"), _driven(judge)
     at_limit = np.minimum(np.abs(q - setup.low), np.abs(q - setup.high)) <= AT_LIMIT
     pressed = {i for i, joint in enumerate(setup.joints) if at_limit[i] and joint not in driven}
@@ -200,7 +200,7 @@ def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         if friction[i] > 0.0 and off and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i]):
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"
-            text += "; raise Kp" * bool(judge.aims and friction[i] <= own.get(joint, 0.0))
+            text += "; raise Kp" * bool(judge.aims)
             share = 1.0 - moved / judge.duration if held else 0.0
             yield Cause("friction", f"joint '{joint}' sticks: {text}", share, joint, moved if held else None)
 

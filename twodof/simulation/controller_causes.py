@@ -8,19 +8,33 @@ import numpy as np
 
 from .cause import FLOOR, MANY_CHANGES, Cause, point_text
 from .judge import BAND, Judge
-from .sampled_loop import spectral_radius
+from .sampled_loop import spectral_radius, stable_gains
 
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 OVERDAMPED = 5.0  # damping ratio from which on less damping is quicker
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
+DRAG = 0.02  # effort of damping, relative to the largest effort in the last quarter, that counts
+
+
+def _gain(judge: Judge, group: str, i: int) -> str:
+    """Return the name of element i of a gain, and its direction or joint, unless all elements are equal."""
+    values = judge.given(group)
+    if len(values) > 1 and not np.ptp(values):
+        return group
+    if group.endswith("_rot"):
+        return f"{group}[{i + 1}] (about {'xyz'[i]})"
+    along = f"along {judge.setup.axes[i]}" if "x" in judge.aims else f"of joint '{judge.setup.joints[i]}'"
+    return f"{group}[{i + 1}] ({along})"
 
 
 def gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     """Yield gains of 0 that act on an error."""
     for group in ("Kp_rot" if name == "quat" else "Kp" for name in missed):
-        zero = [f"{group}[{i + 1}]" for i, gain in enumerate(judge.given(group)) if gain == 0.0]
+        values = judge.given(group)
+        zero = list(dict.fromkeys(_gain(judge, group, i) for i, gain in enumerate(values) if gain == 0.0))
         if zero:
-            yield Cause("gain", f"{', '.join(zero)} = 0: the controller does not reduce this error; raise it", 1.0)
+            text = f"{', '.join(zero)} = 0: the controller does not reduce the error there; raise the gain"
+            yield Cause("gain", text, 1.0)
 
 
 def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -36,21 +50,29 @@ def load(judge: Judge) -> Iterator[Cause]:
     """Yield loads, and the damping of joints, that the controller does not know."""
     if judge.held.get("payload") and not judge.held.get("payload_known"):
         yield Cause(
-            "load", f"the controller does not know the payload of {judge.held['payload']:g} kg; set payload_known", 1.0
+            "load",
+            f"the controller does not know the payload of {judge.held['payload']:g} kg; set payload_known=true",
+            1.0,
         )
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
     each = heavy or [name for name in usual if usual[name] > 0.0]
-    known = f"does not know the damping of joints {', '.join(map(repr, each))}"
-    known = "knows the damping of no joint" if len(each) == len(usual) > 2 else known
+    names = "of any joint" if len(each) == len(usual) > 2 else f"of joints {', '.join(map(repr, each))}"
     kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.0)
-    if each:
-        yield Cause(kind, f"the controller {known}{tail}", share)
+    if each and (heavy or _drags(judge)):
+        yield Cause(kind, f"the controller does not know the damping {names}{tail}", share)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
         if values.any():
             yield Cause("load", f"{group} = {point_text(values)}{unit} acts, which the controller does not know", 0.5)
+
+
+def _drags(judge: Judge) -> bool:
+    """Return whether the damping of a joint needs a part of the efforts in the last quarter of the run."""
+    v, tau = (np.abs(judge.history(name)[-(judge.history(name).shape[0] // 4 + 1) :]) for name in ("v", "tau"))
+    drag = (v * judge.given("damping")).max(initial=0.0)
+    return bool(drag > DRAG * tau.max(initial=0.0))
 
 
 def sampled(judge: Judge) -> Iterator[Cause]:
@@ -64,9 +86,11 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
     i = int(turns.argmax())
     if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
-        gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
+        stiff = next((group for group in ("Kp", "Kd") if judge.given(group).any()), "")
+        gains = f"the gains ({stiff} up to {judge.given(stiff).max():g})" if stiff else "the gains"
+        gains = gains if judge.aims else "the gains of the controller outside"
         what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
-        text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: the gains{gains} are too high"
+        text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: {gains} are too high"
         yield Cause("sampling", f"{text} for {what}", float(turns[i]), setup.joints[i])
     elif any(sampling):
         yield from _unstable(judge, *sampling)
@@ -74,14 +98,19 @@ def sampled(judge: Judge) -> Iterator[Cause]:
 
 def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
     """Yield a cause if the sampled loop is unstable, even while limits hold the joints."""
-    loop = partial(spectral_radius, period=period, delay=delay, differences=bool(judge.setup.starts.get("v_from_q")))
+    differences = bool(judge.setup.starts.get("v_from_q"))
+    loop = partial(spectral_radius, period=period, delay=delay, differences=differences)
     for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
         pairs = enumerate(zip(judge.given(stiff), judge.given(damp)))
         radius, i, p, d = max(((loop(*pair), i, *pair) for i, pair in pairs), default=(0.0, 0, 0.0, 0.0))
         if radius > UNSTABLE:
-            gains = f"{stiff}[{i + 1}] = {p:g} s⁻² and {damp}[{i + 1}] = {d:g} s⁻¹ are too high"
+            names = [_gain(judge, group, i) for group in (stiff, damp)]
+            gains = f"{names[0]} = {p:g} s⁻² and {names[1]} = {d:g} s⁻¹ are too high"
             text = f"{gains} for control_period = {period:g} s and control_delay = {delay:g} s: the loop is unstable"
-            yield Cause("sampling", f"{text}, an error grows {radius:.3g} times in a period", log(radius))
+            text += f", an error doubles in {period * log(2.0) / log(radius):.2g} s"
+            below = stable_gains(p, d, period, delay, differences=differences)
+            text += f"; it is stable below {stiff} = {below[0]:.3g}, {damp} = {below[1]:.3g}" * any(below)
+            yield Cause("unstable", text, log(radius))
 
 
 def _sampling(judge: Judge, i: int) -> Iterator[str]:
@@ -105,7 +134,8 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
         if ratios and min(ratios)[0] < 0.2:
             ratio, i, p, d = min(ratios)
-            text = f"{damp}[{i + 1}] = {d:g} s⁻¹ damps {stiff}[{i + 1}] = {p:g} s⁻² too little"
+            names = [_gain(judge, group, i) for group in (damp, stiff)]
+            text = f"{names[0]} = {d:g} s⁻¹ damps {names[1]} = {p:g} s⁻² too little"
             yield Cause("damping", f"{text}: critical damping is {2.0 * sqrt(p):.4g} s⁻¹", 1.0 - ratio)
 
 

@@ -1,6 +1,10 @@
 """Stability of a sampled controller of a joint or a direction of the task, in closed form."""
 
+from math import sqrt
+
 import numpy as np
+
+COARSE, MOST, FINE = 0.9, 66, 12  # ratio of bandwidths in a search, their number, and bisections after it
 
 
 def spectral_radius(Kp: float, Kd: float, period: float, delay: float, *, differences: bool = False) -> float:
@@ -27,3 +31,22 @@ def spectral_radius(Kp: float, Kd: float, period: float, delay: float, *, differ
     step[2, 0], step[3] = 1.0, command
     step[4:, 3:-1] = np.eye(whole)
     return float(np.abs(np.linalg.eigvals(step)).max())
+
+
+def stable_gains(
+    Kp: float, Kd: float, period: float, delay: float, *, differences: bool = False
+) -> tuple[float, float]:
+    """Return the largest gains Kp and Kd of the same damping ratio, below those of an unstable loop, with a stable one.
+
+    Return zeros if gains with a thousandth of the bandwidth √Kp give none. Arguments: as above.
+    """
+
+    def stable(scale: float) -> bool:
+        return spectral_radius(scale**2 * Kp, scale * Kd, period, delay, differences=differences) < 1.0
+
+    low = next((scale for scale in COARSE ** np.arange(1.0, MOST) if stable(scale)), 0.0)
+    high = low / COARSE
+    for _ in range(FINE if low else 0):
+        middle = sqrt(low * high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low**2 * Kp, low * Kd

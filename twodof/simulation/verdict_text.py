@@ -9,7 +9,8 @@ from .cause import FLOOR, Cause, point_text
 from .judge import AT_LIMIT, Judge
 
 STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
-MANY = 10.0  # overshoot from which on a multiple is printed, and no percentage
+MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
+RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
 UNITS = {"x": "m"}  # of errors, rad for the others
 SWITCHES = ("payload_known", "limit_effort")
 CONTROLLER = {
@@ -30,31 +31,31 @@ def lines_of(
     """Return the lines of a verdict; the first has the outcome and the first cause."""
     off = ", ".join(_distances(judge, numbers))
     head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
+    causes = _grouped(why)
     if why:
         but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
-        head += f"{but}{why[0].text}"
+        head += f"{but}{causes[0].text}"
     elif outcome.startswith("not"):
         head += "; no cause is seen in the samples"
+    also = [f"also {cause.text}" for cause in causes[1:] if not cause.noted]
+    notes = [f"note: {cause.text}" for cause in causes[1:] if cause.noted and why[0].kind not in RUNAWAY]
     settings = _settings(judge) if outcome.startswith("not") else ""
-    lines = [head, *_also(why), _response(judge, outcome, motion, numbers), _peaks(judge, why), settings]
+    lines = [head, *also, *notes, _response(judge, outcome, motion, numbers, why), _peaks(judge, why), settings]
     return tuple(filter(None, lines))
 
 
-def _also(why: tuple[Cause, ...]) -> list[str]:
-    """Return lines for the causes after the first, and then notes of consequences.
-
-    A line has the worst cause of a kind, and the joints of the others.
-    """
-    lines = []
-    for noted, word in ((False, "also"), (True, "note:")):
-        part = [cause for cause in why if cause.noted is noted]
-        kinds = {cause.kind: [other for other in part if other.kind == cause.kind] for cause in part}
-        for worst, *others in kinds.values():
-            joints = dict.fromkeys(cause.joint for cause in others if cause.joint not in ("", worst.joint))
+def _grouped(why: tuple[Cause, ...]) -> list[Cause]:
+    """Return the worst cause of each kind with the joints of its others, and all causes without a joint."""
+    grouped: list[Cause] = []
+    for cause in why:
+        same = [other for other in why if other.joint and (other.kind, other.noted) == (cause.kind, cause.noted)]
+        if cause not in same:
+            grouped.append(cause)
+        elif cause is same[0]:
+            joints = dict.fromkeys(other.joint for other in same if other.joint != cause.joint)
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
-            parts = [f"{word} {worst.text}"] * (worst is not why[0]) + [f"likewise {names}"] * bool(names)
-            lines += ["; ".join(parts), *(f"{word} {cause.text}" for cause in others if not cause.joint)]
-    return lines
+            grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
+    return grouped
 
 
 def _settings(judge: Judge) -> str:
@@ -80,27 +81,33 @@ def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
         off = np.abs(judge.wanted("q") - judge.end("q"))
         worst = int(off.argmax())
         far = f"{off[worst]:.3g} {setup.units[worst]}".strip()
-        texts.append(f"joints at most {far} from their targets, '{setup.joints[worst]}'")
+        texts.append(f"joint errors of up to {far} ('{setup.joints[worst]}')")
     return texts
 
 
-def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float]) -> str:
+def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...]) -> str:
     """Return settling, overshoot, RMS error and motion in words."""
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
         firsts = [f"{aim.first:.3g} {UNITS.get(name, 'rad')}" for name, aim in judge.aims.items()]
         late = f"not within 2 % of the first error of {' and '.join(firsts)}"
-        parts.append(late if settling == inf else f"within 2 % after {settling:.4g} s")
+        within = f"within 2 % {'only from' if outcome == 'not reached' else 'after'} {settling:.4g} s"
+        parts.append(late if settling == inf else within + " on" * (outcome == "not reached"))
         if "overshoot" in numbers:
             past = numbers["overshoot"]
-            parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else f"overshoot {past:,.0f} times the way")
+            name, aim = next(iter(judge.aims.items()))
+            far = f"the target is passed by {past * aim.first:.3g} {UNITS.get(name, 'rad')}"
+            parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else far)
+    elif outcome == "not reached":
+        parts.append("the run starts at its target")
     if "rms_error" in numbers:
         parts.append(f"RMS error {numbers['rms_error']:.3g} m")
     if not parts and outcome == "no target":
         return ""
-    rings = (
-        f" at {numbers['frequency']:.4g} Hz, damping ratio {numbers['damping']:.3g}" if "frequency" in numbers else ""
-    )
+    rings = ""
+    if "frequency" in numbers and not {"unstable", "sampling"} & {cause.kind for cause in why[:1]}:
+        grows = " with a growing amplitude" * bool(motion == "oscillating" and numbers["damping"] < 0.0)
+        rings = f" at {numbers['frequency']:.4g} Hz{grows}, damping ratio {numbers['damping']:.3g}"
     end = motion + rings if motion in ("oscillating", "diverging") else _rest(judge, outcome) or motion
     return ", ".join([*parts, f"{end} at the end"])
 
@@ -120,9 +127,9 @@ def _rest(judge: Judge, outcome: str) -> str:
 
 def _peaks(judge: Judge, why: tuple[Cause, ...]) -> str:
     """Return the peaks in words, as fractions of the URDF's limits; the causes have those beyond."""
-    texts, beyond = [], {cause.kind for cause in why}
-    for kind, what, use in zip(("effort", "velocity"), ("effort", "speed"), judge.use()):
-        if use.max(initial=0.0) > 0.0 and kind not in beyond:
+    texts, named = [], {cause.kind for cause in why}
+    for kinds, what, use in zip(({"effort", "saturation"}, {"velocity"}), ("effort", "speed"), judge.use()):
+        if use.max(initial=0.0) > 0.0 and not kinds & named:
             worst = int(use.argmax())
             texts.append(f"peak {what} {100.0 * use[worst]:.3g} % of the limit of joint '{judge.setup.joints[worst]}'")
     return ", ".join(texts)
