@@ -16,6 +16,7 @@ import numpy as np
 import pandas
 import pytest
 from harness import forged, python
+from tools import needs
 
 import twodof
 from twodof.version import versions
@@ -57,6 +58,7 @@ assert not [name for name in sys.modules if name.startswith("pinocchio.")]
 """
 
 
+@pytest.mark.needs("cyclonedds")
 def test_names_are_the_public_ones_and_no_module_takes_their_place():
     for module in pkgutil.walk_packages(twodof.__path__, "twodof."):
         if not module.name.endswith("__main__"):
@@ -117,10 +119,13 @@ def test_a_users_program_is_checked_by_its_types(tmp_path):
     ],
 )
 def test_an_unknown_keyword_is_an_error_of_the_called_function(call, told, native_path):
+    if told.startswith("publish"):
+        needs("cyclonedds")
     with pytest.raises(TypeError, match=f"^{told}"):
         call(native_path)
 
 
+@pytest.mark.needs("cyclonedds")
 def test_public_signatures_name_every_keyword():
     """An editor and ``help`` show names, types and defaults."""
     for name in dir(twodof):

@@ -3,6 +3,8 @@
 The references are the loop closed in Python by the same equation, and the bag read by the MCAP project.
 """
 
+# ruff: noqa: E402
+
 import functools
 import json
 import re
@@ -18,6 +20,9 @@ from bags import SECOND
 from harness import wait_until
 from mcap.reader import make_reader
 from nodes import ended, environment, published, recorded, stamp_of
+from tools import needs
+
+needs("cyclonedds")
 
 import twodof
 from twodof.cli.main import main

@@ -314,6 +314,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.needs("cyclonedds")
 def test_a_pose_on_the_network_is_the_target(
     fmus, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

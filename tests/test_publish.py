@@ -4,6 +4,8 @@ The reference is the bag recorded at the same time, read by the MCAP project's r
 interface, or in network namespaces without a route out.
 """
 
+# ruff: noqa: E402
+
 import json
 import re
 import signal
@@ -18,6 +20,9 @@ import pytest
 from bags import SECOND, assert_consistent
 from harness import python, wait_until
 from nodes import CABLE, COMMANDS, LATCHED, STREAMS, ended, environment, isolated, published, recorded, stamp_of
+from tools import needs
+
+needs("cyclonedds")
 
 import twodof
 from twodof.cli.main import main

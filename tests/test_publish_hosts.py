@@ -1,5 +1,7 @@
 """The hosts and nodes that can command a published run: two network namespaces, and two controllers."""
 
+# ruff: noqa: E402
+
 import json
 import re
 import signal
@@ -9,11 +11,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from harness import wait_until
+from nodes import CABLE, Node, ended, isolated, published
+from tools import needs
+
+needs("cyclonedds")
+
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
-from harness import wait_until
-from nodes import CABLE, Node, ended, isolated, published
 
 import twodof
 from twodof.ros.dds import dds_qos, dds_topic

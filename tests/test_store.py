@@ -187,6 +187,7 @@ def test_a_robot_that_does_not_begin_costs_no_bag(fmus, tmp_path):
     assert (kept / "bag.mcap").read_bytes() == before
 
 
+@pytest.mark.needs("cyclonedds")
 def test_a_sink_is_of_a_robot_that_there_is(fmus):
     with pytest.raises(InputError, match="'lift', but the robots are left, fleet/right"):
         twodof.publish_together(runs(fmus, 0.02), sinks={"lift": []})

@@ -106,7 +106,7 @@ def needs(name: str) -> str:
 
 
 def missing(name: str) -> NoReturn:
-    """End a test that this machine cannot run; CI can run all of them."""
+    """End a test, or the import of tests, that this machine cannot run; CI can run all of them."""
     import pytest
 
     tool = TOOLS[name]
@@ -114,7 +114,7 @@ def missing(name: str) -> NoReturn:
     reason = f"of {tool.subject} were not run: {remedy}"
     if os.environ.get("CI"):
         pytest.fail(f"tests {reason}")
-    pytest.skip(reason)
+    pytest.skip(reason, allow_module_level=True)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
