@@ -130,7 +130,7 @@ FAILURES = {
             "limit_effort": True,
             "q_des": (0.2, -1.1, 1.5, 0.3, -0.9, 0.4),
         },
-        ("sampling", "saturation"),
+        ("unstable", "saturation"),
         "too high for control_period = 0.08 s",
     ),
     "a stiff law without damping": Failure(

@@ -336,7 +336,7 @@ SADDLED = {"payload": 9.0, "payload_known": True, "limit_effort": True, "gravity
         ("task", {"q_min": [0.2, -3.0]}, "joint 'joint1' is at its lower limit"),
         ("task", {"f_ext": [0.0, 3.0, 0.0]}, "f_ext = (0, 3, 0) acts"),
         ("task", {"payload": 3.0, "f_ext": [0.0, 1.0, 0.0]}, "the controller does not know the payload of 3 kg"),
-        ("task", {"Kp": [50.0, 0.0]}, "Kp[2] (along y) = 0: the controller does not"),
+        ("task", {"Kp": [50.0, 0.0]}, "Kp[2] (along y) = 0: the controller does not reduce"),
         ("task", {"Kd": 0.0, "Kp": 20.0}, "Kd = 0 s⁻¹ damps too little: critical is 8.944 s⁻¹"),
         ("joint", {"friction": [20.0, 0.0]}, "joint 'joint1' sticks: its friction of 20 N·m holds it"),
         ("joint", SADDLED, "the motor of joint 'joint1' is saturated for 9"),

@@ -115,7 +115,10 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
         ({"Kp": 1000.0, "Kd": 5.0, "x_des": (-0.107, 0.4107)}, "beyond the URDF's limit of 10 N·m; likewise 'joint2'"),
         (LATE, "it is stable below Kp = 189, Kd = 22.9"),
         ({**NOISY, "Kp": 900.0}, "joint 'joint1' reverses every 0.034 s: the gains (Kp up to 900) are too high for"),
-        ({**NOISY, "Kp": (900.0, 0.0)}, "Kp[2] (along y) = 0: the controller does not reduce the error there"),
+        (
+            {**NOISY, "Kp": (900.0, 0.0)},
+            "Kp[2] (along y) = 0: the controller does not reduce the error of the position",
+        ),
         ({"q_max": (0.6, 0.4)}, "at rest with 'joint1', 'joint2' at their limits"),
         ({"payload": 2.0, "limit_effort": True}, "payload = 2 kg, limit_effort = true"),
     ],
@@ -173,8 +176,9 @@ def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:
 
 def test_a_line_names_each_joint_once() -> None:
     stands = [Cause("limit", f"joint '{name}' stood", joint=name) for name in ("a", "b", "a", "c", "b")]
-    texts = [cause.text for cause in _grouped((Cause("gain", "a gain"), *stands))]
-    assert texts == ["a gain", "joint 'a' stood; likewise 'b', 'c'"]
+    for count, others in ((4, "'b', 'c'"), (3, "all other joints")):
+        texts = [cause.text for cause in _grouped((Cause("gain", "a gain"), *stands), count)]
+        assert texts == ["a gain", f"joint 'a' stood; likewise {others}"]
 
 
 def test_a_bag_a_figure_and_a_page_say_the_same(

@@ -56,7 +56,8 @@ export class Verdict {
     return causes.flatMap((each) => {
       const same = causes.filter(({ kind, noted, joint }) => joint >= 0 && kind === each.kind && noted === each.noted);
       if (each.joint < 0) return [each];
-      const names = same.slice(1).map(({ joint }) => `'${this.joints[joint].name}'`).join(", ");
+      const names = same.length === this.joints.length && same.length > 2 ? "all other joints"
+        : same.slice(1).map(({ joint }) => `'${this.joints[joint].name}'`).join(", ");
       return each === same[0] ? [{ ...each, text: each.text + (names && `; likewise ${names}`) }] : [];
     });
   }
@@ -183,7 +184,7 @@ export class Verdict {
   gains(missed) {
     const zero = GAINS.flatMap(([stiff], k) =>
       missed[k] ? this.session.held(stiff).flatMap((gain, i) => (gain === 0 ? [this.gain(stiff, i)] : [])) : []);
-    const text = `${[...new Set(zero)].join(", ")} = 0: the controller does not reduce the error there; raise the gain`;
+    const text = `${[...new Set(zero)].join(", ")} = 0: the controller does not reduce this error; raise the gain`;
     return zero.length ? [cause("gain", text)] : [];
   }
 
@@ -257,7 +258,7 @@ export class Verdict {
     return most("v", [...session.held("damping")]) > DRAG * most("tau", this.joints.map(() => 1));
   }
 
-  /** A joint that reverses as fast as the controller's steps, or else gains of an unstable loop. */
+  /** Gains of an unstable loop, or else a joint that reverses as fast as the controller's steps. */
   sampled() {
     const { session, joints } = this, last = session.count - 1, first = Math.max(0, last + 1 - TAIL);
     const [period, delay] = ["control_period", "control_delay"].map((name) => Number(session.values.get(name) ?? 0));
@@ -267,6 +268,13 @@ export class Verdict {
       const value = Number(session.values.get(name) ?? 0);
       return value ? [`${name} = ${short(value)} ${this.session.variable(name).unit}`] : [];
     }).join(", ");
+    const differences = session.values.get("v_from_q") === true;
+    const unstable = GAINS.flatMap(([stiff, damp]) => {
+      const Kd = session.held(damp), radii = session.held(stiff).map((p, i) => spectralRadius(p, Kd[i], period, delay, differences));
+      const i = radii.indexOf(Math.max(...radii));
+      return radii[i] > UNSTABLE ? [cause("unstable", `${this.gain(stiff, i)} and ${this.gain(damp, i)} are too high for ${settings()}: the loop is unstable`)] : [];
+    });
+    if (unstable.length) return unstable;
     const turns = joints.map((_, i) => {
       const v = Array.from({ length: last + 1 - first }, (__, k) => session.value("v", first + k, i));
       const peak = Math.max(...this.picked().map((k) => Math.abs(session.value("v", k, i))), 1e-3);
@@ -274,16 +282,9 @@ export class Verdict {
       return moves ? v.filter((value, k) => k && value * v[k - 1] < 0).length / (v.length - 1) : 0;
     });
     const most = Math.max(...turns), joint = turns.indexOf(most), step = this.robot.facts.step;
-    if (most * Math.max(step, period + delay) >= FAST * step) {
-      const often = `joint '${joints[joint].name}' reverses every ${short(step / most)} s`;
-      return [cause("sampling", `${often}: the gains are too high for ${settings(joint + 1)}`)];
-    }
-    const differences = session.values.get("v_from_q") === true;
-    return GAINS.flatMap(([stiff, damp]) => {
-      const Kd = session.held(damp), radii = session.held(stiff).map((p, i) => spectralRadius(p, Kd[i], period, delay, differences));
-      const i = radii.indexOf(Math.max(...radii));
-      return radii[i] > UNSTABLE ? [cause("unstable", `${this.gain(stiff, i)} and ${this.gain(damp, i)} are too high for ${settings()}: the loop is unstable`)] : [];
-    });
+    const often = `joint '${joints[joint].name}' reverses every ${short(step / most)} s`;
+    if (most * Math.max(step, period + delay) < FAST * step) return [];
+    return [cause("sampling", `${often}: the gains are too high for ${settings(joint + 1)}`)];
   }
 
   /** @type {(missed: boolean[]) => Cause[]} */

@@ -29,11 +29,12 @@ def _gain(judge: Judge, group: str, i: int) -> str:
 
 def gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     """Yield gains of 0 that act on an error."""
-    for group in ("Kp_rot" if name == "quat" else "Kp" for name in missed):
+    for name in missed:
+        group, error = ("Kp_rot", "orientation") if name == "quat" else ("Kp", "position" if name == "x" else "joints")
         values = judge.given(group)
         zero = list(dict.fromkeys(_gain(judge, group, i) for i, gain in enumerate(values) if gain == 0.0))
         if zero:
-            text = f"{', '.join(zero)} = 0: the controller does not reduce the error there; raise the gain"
+            text = f"{', '.join(zero)} = 0: the controller does not reduce the error of the {error}; raise the gain"
             yield Cause("gain", text, 1.0)
 
 
@@ -76,11 +77,14 @@ def _drags(judge: Judge) -> bool:
 
 
 def sampled(judge: Judge) -> Iterator[Cause]:
-    """Yield a joint that reverses as fast as the steps, or a sampled loop that is unstable."""
+    """Yield sampled loops that are unstable, or else a joint that reverses as fast as the steps."""
     v, setup = judge.tail("v")[-256:], judge.setup
     sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
     continuous = bool(judge.aims) and not any(sampling) and judge.changes <= MANY_CHANGES
     if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
+        return
+    if any(sampling) and (found := [*_unstable(judge, *sampling)]):
+        yield from found
         return
     turns = (np.sign(v[1:]) * np.sign(v[:-1]) < 0.0).mean(axis=0)
     turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
@@ -92,8 +96,6 @@ def sampled(judge: Judge) -> Iterator[Cause]:
         what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
         text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: {gains} are too high"
         yield Cause("sampling", f"{text} for {what}", float(turns[i]), setup.joints[i])
-    elif any(sampling):
-        yield from _unstable(judge, *sampling)
 
 
 def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
@@ -106,7 +108,8 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
         if radius > UNSTABLE:
             names = [_gain(judge, group, i) for group in (stiff, damp)]
             gains = f"{names[0]} = {p:g} s⁻² and {names[1]} = {d:g} s⁻¹ are too high"
-            text = f"{gains} for control_period = {period:g} s and control_delay = {delay:g} s: the loop is unstable"
+            late = f" and control_delay = {delay:g} s" * bool(delay)
+            text = f"{gains} for control_period = {period:g} s{late}: the loop is unstable"
             text += f", an error doubles in {period * log(2.0) / log(radius):.2g} s"
             below = stable_gains(p, d, period, delay, differences=differences)
             text += f"; it is stable below {stiff} = {below[0]:.3g}, {damp} = {below[1]:.3g}" * any(below)

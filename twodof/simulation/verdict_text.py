@@ -31,7 +31,7 @@ def lines_of(
     """Return the lines of a verdict; the first has the outcome and the first cause."""
     off = ", ".join(_distances(judge, numbers))
     head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
-    causes = _grouped(why)
+    causes = _grouped(why, len(judge.setup.joints))
     if why:
         but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
         head += f"{but}{causes[0].text}"
@@ -44,8 +44,8 @@ def lines_of(
     return tuple(filter(None, lines))
 
 
-def _grouped(why: tuple[Cause, ...]) -> list[Cause]:
-    """Return the worst cause of each kind with the joints of its others, and all causes without a joint."""
+def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
+    """Return the worst cause of each kind with the joints, of ``count``, of its others, and all causes without one."""
     grouped: list[Cause] = []
     for cause in why:
         same = [other for other in why if other.joint and (other.kind, other.noted) == (cause.kind, cause.noted)]
@@ -54,6 +54,7 @@ def _grouped(why: tuple[Cause, ...]) -> list[Cause]:
         elif cause is same[0]:
             joints = dict.fromkeys(other.joint for other in same if other.joint != cause.joint)
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
+            names = "all other joints" if len(joints) == count - 1 > 1 else names
             grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
     return grouped
 
