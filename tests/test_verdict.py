@@ -27,7 +27,8 @@ from twodof.simulation import master
 from twodof.simulation.cause import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
-from twodof.simulation.setup import robot_of
+from twodof.simulation.setup import robot_of, setup
+from twodof.simulation.verdict import judged
 from twodof.simulation.verdict_text import _grouped
 
 STEP = 0.001
@@ -490,3 +491,20 @@ def test_bags_of_others_with_odd_stamps_and_numbers_are_judged_without_a_warning
     bag = third_party_bag(tmp_path / "bag", ["a", "b"], t, q, np.zeros_like(q) if velocities else None)
     verdict = twodof.read_bag(bag).verdict
     assert verdict.motion == motion and "nan" not in " ".join(verdict.lines)
+
+
+@pytest.mark.parametrize("tau", [0, 2])
+@pytest.mark.parametrize("starts", [{}, {"Kp[1]": 0.0, "Kp[2]": 5.0, "Kp[3]": 0.0, "damping[1]": 1.0}])
+def test_a_run_of_others_with_fewer_or_more_parameters_than_joints_is_judged(tau, starts):
+    """The robot has damping, which the run may not state, and the controller is another's."""
+    text = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text("utf-8")
+    text = text.replace("<limit", '<dynamics damping="0.5"/><limit')
+    robot, t, q = read_urdf(text), np.arange(0.0, 2.0, 0.01), np.zeros((200, 2))
+    assert [joint.damping for joint in robot.joints.values()].count(0.5) == 2
+    sizes = {"q": 2, "v": 2, "x": 0, "tau": tau, "quat": 0}
+    values = {name: np.ones((200, size)) for name, size in sizes.items()}
+    made = setup(joints=[*robot.joints][:2], robot=robot, frame="", axes="", step=0.01, starts=starts)
+    verdict = judged(made, t, values, {"q": q})
+    zero = [cause.text for cause in verdict.causes if cause.kind == "gain"]
+    assert verdict.outcome == "not reached" and "drag" not in {cause.kind for cause in verdict.causes}
+    assert [text[:15] for text in zero] == ["Kp[1], Kp[3] = "][: bool(starts)]

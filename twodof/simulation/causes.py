@@ -209,7 +209,7 @@ def _singular(judge: Judge) -> Iterator[Cause]:
     setup, q, t = judge.setup, judge.history("q"), judge.history()
     rows = [*setup.rows, *((3, 4, 5) if judge.wanted("quat").size else ())]
     moving = {joint.leader for joint in _chain(judge)} & {*setup.joints}
-    if len(rows) > len(moving):  # singular everywhere
+    if not 0 < len(rows) <= len(moving):  # without an end effector, or singular everywhere
         return
     sigma = np.linalg.svd(setup.kinematics.jacobian(setup.frame, q)[:, rows], compute_uv=False)
     ratio = sigma[:, -1] / np.maximum(sigma[:, 0], 1e-300)

@@ -21,10 +21,10 @@ def _gain(judge: Judge, group: str, i: int) -> str:
     values = judge.given(group)
     if len(values) > 1 and not np.ptp(values):
         return group
-    if group.endswith("_rot"):
-        return f"{group}[{i + 1}] (about {'xyz'[i]})"
-    along = f"along {judge.setup.axes[i]}" if "x" in judge.aims else f"of joint '{judge.setup.joints[i]}'"
-    return f"{group}[{i + 1}] ({along})"
+    axes, joints = judge.setup.axes if "x" in judge.aims else "", judge.setup.joints
+    each = [f"about {axis}" for axis in "xyz"] if group.endswith("_rot") else [f"along {axis}" for axis in axes]
+    each = each or [f"of joint '{joint}'" for joint in joints]
+    return f"{group}[{i + 1}] ({each[i]})" if len(each) == len(values) else f"{group}[{i + 1}]"
 
 
 def gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -71,9 +71,10 @@ def load(judge: Judge) -> Iterator[Cause]:
 
 def _drags(judge: Judge) -> bool:
     """Return whether the damping of a joint needs a part of the efforts in the last quarter of the run."""
-    v, tau = (np.abs(judge.history(name)[-(judge.history(name).shape[0] // 4 + 1) :]) for name in ("v", "tau"))
-    drag = (v * judge.given("damping")).max(initial=0.0)
-    return bool(drag > DRAG * tau.max(initial=0.0))
+    late, damping = slice(-(len(judge.history()) // 4 + 1), None), judge.given("damping")
+    v, tau = (np.abs(judge.history(name)[late]) for name in ("v", "tau"))
+    known = v.shape[1] == tau.shape[1] == len(damping)
+    return known and bool((v * damping).max(initial=0.0) > DRAG * tau.max(initial=0.0))
 
 
 def sampled(judge: Judge) -> Iterator[Cause]:
