@@ -145,10 +145,27 @@ static int set_law(const double value[N_VARIABLES], const JointPosition joint[N_
     return 0;
 }
 
+/* Set the columns of the parameters that are inputs to M ∂q̈ with constant reactions. */
+static void add_free_parameters(const Plant *plant, const Stops *stops, const double reaction[N_JOINTS],
+                                const Dynamics *all, double slope[N_JOINTS][X])
+{
+    const int moves[N_JOINTS] = {FREE};
+    Plant acting = *plant;
+    for (int i = 0; i < N_JOINTS; i++)
+        acting.value[TAU_EXT + i] += reaction[i];
+    for (int k = Q - N_FREE; k < Q; k++) {
+        double change[X] = {0}, derivative[FIRST_PARAMETER];
+        change[k] = 1.0;
+        differentiate(acting.value, moves, stops->slip, stops->rank, WANTS_RATES, change, derivative);
+        for (int i = 0; i < N_JOINTS; i++)
+            slope[i][k] = dot_of(all->M[i], &derivative[DER_V], N_JOINTS);
+    }
+}
+
 void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_JOINTS][X])
 {
     const double *value = plant->value, *v = &value[V], nothing[N_JOINTS + 3] = {0};
-    double a[N_JOINTS], given[N_JOINTS], acts[N_JOINTS] = {0}, minus[N_JOINTS], effort[N_JOINTS];
+    double a[N_JOINTS], given[N_JOINTS], acts[N_JOINTS] = {0}, minus[N_JOINTS], reaction[N_JOINTS] = {0};
     JointPosition joint[N_BODIES];
     Dynamics all;
     Stops reacting = *stops;
@@ -162,9 +179,9 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
     }
     place_joints(&value[Q], joint);
     memcpy(a, &value[DER_V], sizeof a);
-    if (clamped) { /* for the other joints, a clamped joint moves on */
+    if (clamped || N_FREE) { /* for the other joints, a clamped joint moves on */
         acceleration(plant, &value[Q], v, slip_of(stops), stops->rank, a, NULL);
-        restrain(plant, &reacting, &value[Q], a, effort);
+        restrain(plant, &reacting, &value[Q], a, reaction);
     }
     if (!is_held(value)) {
         command(value, joint, &value[Q], v, stops->rank, given, NULL);
@@ -188,18 +205,13 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
         slope[i][TAU_EXT + i] = 1.0;
         slope[i][V + i] -= value[DAMPING + i];
     }
+    if (N_FREE)
+        add_free_parameters(plant, stops, reaction, &all, slope);
     divide_by_mass(all.M, stops, first, slope);
     if (cancels && deviates)
         compute_dynamics(value, joint, 0, v, given, &value[GRAVITY], &all);
     if (cancels)
         add_command(value, joint, stops, first, given, all.motion, slope);
-    for (int k = Q - N_FREE; k < Q; k++) { /* by parameters that are inputs */
-        double change[X] = {0}, derivative[FIRST_PARAMETER];
-        change[k] = 1.0;
-        differentiate(value, stops->held, stops->slip, stops->rank, WANTS_RATES, change, derivative);
-        for (int i = 0; i < N_JOINTS; i++)
-            slope[i][k] = derivative[DER_V + i];
-    }
     for (int i = 0; i < N_JOINTS; i++) {
         if (stops->held[i])
             memset(slope[i], 0, sizeof slope[i]);
