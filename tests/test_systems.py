@@ -486,6 +486,69 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     again = '<ssd:ParameterBinding source="p.ssv"/>' * 100
     again = f"<ssd:ParameterBindings>{again}</ssd:ParameterBindings>"
     yield "bound again", ssd(again + BOTH), {"p.ssv": kilobytes.encode()}, "have more than 8388608 bytes"
+    deep = f"<ssd:Elements>{component('plant')}</ssd:Elements>"
+    for k in range(80):
+        deep = f'<ssd:Elements><ssd:System name="{"n" * 50_000}{k}">{deep}</ssd:System></ssd:Elements>'
+    yield "long names", ssd(deep), {}, "has a name of more than 1000 characters"
+    offset = "<ssd:Units><ssc:Unit name='u'><ssc:BaseUnit rad='1' {}/></ssc:Unit></ssd:Units>"
+    own = connectors({"x": "input u"}) + BOTH + f"<ssd:Connections>{connection('x', 'pd.q[1]')}</ssd:Connections>"
+    yield "infinite offset", ssd(own, offset.format("offset='INF'")), {}, "have no finite conversion"
+    yield "factor 0", ssd(own, offset.format("factor='0'")), {}, "has no valid factor"
+    yield from large_systems()
+
+
+def described(variables: str, structure: str = "", version: str = "2.0") -> bytes:
+    """Return an FMU that is only its description."""
+    identity = "guid" if version == "2.0" else "instantiationToken"
+    xml = (
+        f'<fmiModelDescription fmiVersion="{version}" modelName="m" {identity}="m">'
+        f'<CoSimulation modelIdentifier="m"/><ModelVariables>{variables}</ModelVariables>'
+        f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
+    )
+    return zipped({"modelDescription.xml": xml.encode()})
+
+
+def large_systems() -> Iterator[tuple[str, bytes, dict[str, bytes], str]]:
+    """Yield systems of a few files in which the number of values multiplies."""
+    array = described(
+        '<Float64 name="time" valueReference="0" causality="independent" variability="continuous"/>'
+        '<Float64 name="u" valueReference="1" causality="input" start="0"><Dimension start="49000"/></Float64>',
+        version="3.0",
+    )
+    many = "".join(component(f"c{k}").replace(f"c{k}.fmu", "u.fmu") for k in range(99))
+    variables = "components have more than 200000 variables"
+    yield "arrays", ssd(f"<ssd:Elements>{many}</ssd:Elements>"), {"resources/u.fmu": array}, variables
+
+    names = [f"u{k}" for k in range(15_000)]
+    scalars = "".join(
+        f'<ScalarVariable name="{name}" valueReference="{k}" causality="input" variability="continuous">'
+        '<Real start="0"/></ScalarVariable>'
+        for k, name in enumerate(names)
+    )
+    parts = component("u")
+    inside = "".join(connection("x", f"u.{name}") for name in names)
+    for _ in range(95):
+        parts = (
+            f'<ssd:System name="s">{connectors({"x": "input"})}<ssd:Elements>{parts}</ssd:Elements>'
+            f"<ssd:Connections>{inside}</ssd:Connections></ssd:System>"
+        )
+        inside = connection("x", "s.x")
+    wiring = "more than 1000000 connections"
+    yield "row", ssd(f"<ssd:Elements>{parts}</ssd:Elements>"), {"resources/u.fmu": described(scalars)}, wiring
+
+    few = range(1500)
+    kinds = {"u": ("input", "start='0'"), "y": ("output", "")}
+    both = "".join(
+        f'<ScalarVariable name="{name}{k}" valueReference="{2 * k + (name == "y")}" causality="{kind}"'
+        f' variability="continuous"><Real {start}/></ScalarVariable>'
+        for k in few
+        for name, (kind, start) in kinds.items()
+    )
+    unknown = "".join(f'<Unknown index="{2 * k + 2}"/>' for k in few)
+    wires = "".join(connection(f"{a}.y{k}", f"{b}.u{k}") for k in few for a, b in ("ab", "bc"))
+    parts = "".join(component(name).replace(f"{name}.fmu", "u.fmu") for name in "abc")
+    system = ssd(f"<ssd:Elements>{parts}</ssd:Elements><ssd:Connections>{wires}</ssd:Connections>")
+    yield "feedthrough", system, {"resources/u.fmu": described(both, f"<Outputs>{unknown}</Outputs>")}, wiring
 
 
 @pytest.mark.parametrize(

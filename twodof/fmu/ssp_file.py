@@ -21,7 +21,7 @@ import fmpy.ssp
 import lxml.etree
 from fmpy.model_description import DefaultExperiment
 
-from ..bounds import MAX_COMPONENTS, MAX_DESCRIPTION
+from ..bounds import MAX_COMPONENTS, MAX_DESCRIPTION, MAX_NAME
 from ..errors import ZIP_ERRORS, FmuError
 from ..files import check_archive, read_member
 from .validation import NUMBERS, TRUE, is_plain_xml
@@ -173,6 +173,8 @@ class _File:
 
     def element(self, xml: ET.Element, name: str, units: dict[str, Unit]) -> Element:
         """Return a system with the elements inside it, or a component."""
+        if len(name) > MAX_NAME:
+            raise FmuError(f"'{self._path}': '{name:.40}'… has a name of more than {MAX_NAME} characters")
         connectors = {}
         for connector in xml.iterfind(f"{SSD}Connectors/{SSD}Connector"):
             kind = next((child for child in connector if child.tag.startswith(SSC)), None)

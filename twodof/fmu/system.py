@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..bounds import MAX_DESCRIPTIONS
+from ..bounds import MAX_DESCRIPTIONS, MAX_VARIABLES
 from ..errors import FmuError, choice
 from ..export.package import has_member
 from .description import Fmu, Scalar, load_any_fmu, logged
@@ -122,15 +122,15 @@ def load_system(path: Path, robot: str = "") -> System:
     title, top, times, structure = read_ssp(path)
     fmus: dict[str, Fmu] = {}
     by_source: dict[str, Fmu] = {}
-    room = MAX_DESCRIPTIONS
-    for element in top.walk():
-        if element.source and element.source not in by_source:
-            by_source[element.source] = fmu = load_any_fmu(path, element.source)
-            room -= fmu.described
-            if room < 0:
-                raise FmuError(f"'{path}': the descriptions of its FMUs are larger than {MAX_DESCRIPTIONS} bytes")
-        if element.source:
-            fmus[element.name] = by_source[element.source]
+    room, free = MAX_DESCRIPTIONS, MAX_VARIABLES
+    for element in (each for each in top.walk() if each.source):
+        if element.source not in by_source:
+            by_source[element.source] = load_any_fmu(path, element.source)
+        fmus[element.name] = fmu = by_source[element.source]
+        room, free = room - fmu.described, free - len(fmu.variables)
+        if room < 0 or free < 0:
+            most = f"{MAX_VARIABLES} variables, or descriptions of more than {MAX_DESCRIPTIONS} bytes"
+            raise FmuError(f"'{path}': its components have more than {most}")
     wiring = Wiring(path, top, fmus)
     links = wiring.links()
     batches = order(path, fmus, links)

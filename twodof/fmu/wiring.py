@@ -8,7 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
-from ..bounds import MAX_COMPONENTS
+from ..bounds import MAX_COMPONENTS, MAX_WIRING
 from ..errors import FmuError, choice
 from .description import Fmu, Scalar
 from .ssp_file import EXPONENTS, IDENTITY, Affine, Connector, Element, Unit, transformation
@@ -138,19 +138,19 @@ class Wiring:
         Raises:
             FmuError: connections form a loop without a component, or connect different types or units.
         """
-        found = []
+        found, room = [], MAX_WIRING
         for target in self._incoming:
             if target.element not in self._fmus:
                 continue
             way = [target]
             while way[-1] in self._incoming:
-                source = self._incoming[way[-1]][0]
-                if source in way or len(way) > MAX_COMPONENTS:
+                if len(way) > MAX_COMPONENTS:
                     what = f"a circle of systems, or longer than {MAX_COMPONENTS}"
                     raise FmuError(f"'{self._path}': the connections to '{target}' are {what}")
-                way.append(source)
-                if source.element in self._fmus:
+                way.append(self._incoming[way[-1]][0])
+                if way[-1].element in self._fmus:
                     break
+            room = _spent(self._path, room, len(way))
             found.append(Link(way[-1], target, self._map(way[::-1])))
         return found
 
@@ -170,6 +170,8 @@ class Wiring:
             raise FmuError(f"'{self._path}': '{way[0]}' and '{way[-1]}' are of type {types}: not supported")
         if target.causality not in ("input", "parameter") or (source is not None and target.causality == "parameter"):
             raise FmuError(f"'{self._path}': '{way[-1]}' is of causality {target.causality}: not supported")
+        if not all(map(math.isfinite, total)):
+            raise FmuError(f"'{self._path}': the units of '{way[0]}' and '{way[-1]}' have no finite conversion")
         if target.type != "Real" and total != IDENTITY:
             raise FmuError(f"'{self._path}': '{way[-1]}' is of type {target.type}, which is not transformed")
         return total
@@ -193,8 +195,9 @@ class Wiring:
             raise FmuError(
                 f"'{self._path}': {what} have units of different dimensions, '{source.name}' and '{target.name}'"
             )
-        if not (target.factor and math.isfinite(source.factor / target.factor)):
-            raise FmuError(f"'{self._path}': the unit '{target.name}' of {what} has no valid factor")
+        if not (target.factor and source.factor and math.isfinite(source.factor / target.factor)):
+            names = f"'{source.name}' or '{target.name}'"
+            raise FmuError(f"'{self._path}': the unit {names} of {what} has no valid factor")
         return Affine(source.factor / target.factor, (source.offset - target.offset) / target.factor)
 
 
@@ -208,6 +211,14 @@ def _units_of(fmu: Fmu) -> dict[str, Unit]:
     return units
 
 
+def _spent(path: object, room: int, size: int) -> int:
+    """Return what is left of ``MAX_WIRING``."""
+    if size > room:
+        what = "connections, as often as values pass them, or direct dependencies of outputs"
+        raise FmuError(f"'{path}' has more than {MAX_WIRING} {what}; cut it into several systems")
+    return room - size
+
+
 def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[list[Node]]:
     """Return batches of outputs and inputs in the order of evaluation at one instant.
 
@@ -218,20 +229,25 @@ def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[
         FmuError: there is an algebraic loop, which the message names.
     """
     between = [link for link in links if link.source.element in fmus]
-    inputs: dict[str, list[Node]] = {}
+    inputs: dict[str, dict[int, list[Node]]] = {name: {} for name in fmus}  # by value reference
     for link in between:
-        inputs.setdefault(link.target.element, []).append(link.target)
+        name, own = link.target
+        inputs[name].setdefault(fmus[name].variables[own].reference, []).append(link.target)
+    known = {
+        name: {u.variable.valueReference: u.dependencies for u in fmu.description.outputs} for name, fmu in fmus.items()
+    }
     graph: dict[Node, list[Node]] = {link.target: [link.source] for link in between}
+    needs: dict[tuple[str, int], list[Node]] = {}
+    room = MAX_WIRING
     for source in dict.fromkeys(link.source for link in between):
-        fmu = fmus[source.element]
-        known = {u.variable.valueReference: u.dependencies for u in fmu.description.outputs}
-        needed = known.get(fmu.variables[source.connector].reference)
-        references = None if needed is None else {variable.valueReference for variable in needed}
-        graph[source] = [
-            node
-            for node in inputs.get(source.element, [])
-            if references is None or fmu.variables[node.connector].reference in references
-        ]
+        name, here = source.element, inputs[source.element]
+        output = name, fmus[name].variables[source.connector].reference
+        if output not in needs:
+            stated = known[name].get(output[1])
+            references = here if stated is None else dict.fromkeys(variable.valueReference for variable in stated)
+            needs[output] = [node for reference in references for node in here.get(reference, [])]
+        graph[source] = needs[output]
+        room = _spent(path, room, len(needs[output]))
     sorter, batches = TopologicalSorter(graph), []
     try:
         sorter.prepare()
