@@ -122,9 +122,19 @@ def test_meshes_in_hundreds_of_nested_folders_are_refused(linked, monkeypatch):
     for _ in range(700):
         os.mkdir("a")
         os.chdir("a")
-    with pytest.raises(BagError, match=r"cannot recover the bag .*; nothing is lost"):
+    with pytest.raises(BagError, match=r"folders that are nested too deeply; move them out of the bag"):
         twodof.recover(linked)
     assert {file.name for file in linked.parent.iterdir()} == {"bag", "private"}
+
+
+@pytest.mark.parametrize("name", ["bag", "bag-wal", "bag-journal"])
+def test_a_file_of_zeros_without_blocks_is_neither_read_nor_copied(name, linked):
+    (file,) = (file for file in linked.iterdir() if file.suffix in (".mcap", ".db3"))
+    sparse = file.with_name(name.replace("bag", file.name))
+    with sparse.open("ab") as opened:
+        opened.truncate(2**40)
+    with pytest.raises(BagError, match=rf"'{sparse}' is damaged: of its {2**40} bytes only \d+ are on the disk"):
+        twodof.recover(linked)
 
 
 @pytest.mark.parametrize("name", ["%2E", "%2E%2E", "%2F", "a%2F%2E%2E"])

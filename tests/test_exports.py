@@ -2,6 +2,7 @@
 
 import csv
 import json
+import tempfile
 import tracemalloc
 
 import duckdb
@@ -16,6 +17,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import BagError
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +134,13 @@ def test_an_mcap_file_is_written_without_the_bag_in_memory(tmp_path):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 0.5 * path.stat().st_size
+
+
+def test_a_full_folder_for_temporary_files_is_named(disk, bag_path, tmp_path, monkeypatch):
+    full = disk(64)
+    monkeypatch.setattr(tempfile, "tempdir", str(full))
+    with pytest.raises(BagError, match=f"write '.*bag.mcap': No space left on device in '{full}'"):
+        twodof.export_bag(bag_path, tmp_path / "bag.mcap")
 
 
 def test_an_export_does_not_replace_a_file_of_its_bag(bag_path, tmp_path):

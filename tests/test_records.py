@@ -262,6 +262,18 @@ def test_joint_states_in_memory_are_bounded(bag, monkeypatch):
         read_bag(bag)
 
 
+def test_a_small_bag_does_not_unpack_to_many_joint_states(bag, monkeypatch):
+    records = message(joint_state(2, START)) * 30_000
+    loose = TOPIC + records + FOOTER
+    packed = zstandard.ZstdCompressor().compress(records)
+    monkeypatch.setattr(reader, "MAX_DRAWN", 2**18)
+    (bag / "bag.mcap").write_bytes(loose)
+    assert read_bag(bag).count == 30_000
+    (bag / "bag.mcap").write_bytes(TOPIC + chunk(packed, len(records), "zstd") + FOOTER)
+    with pytest.raises(BagError, match="unpacks to more than 0 MiB of joint states"):
+        read_bag(bag)
+
+
 # --- provenance ---
 
 

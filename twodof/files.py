@@ -42,7 +42,8 @@ def refusing(kind: type[TwoDofError], what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise kind(f"cannot {what}: {error.strerror}") from error
+        where = f" in '{error.filename}'" if error.errno == errno.ENOSPC and error.filename else ""  # maybe TMPDIR
+        raise kind(f"cannot {what}: {error.strerror}{where}") from error
 
 
 def check_file(path: str | Path, most: int) -> None:

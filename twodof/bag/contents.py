@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..bounds import MAX_METADATA
+from ..bounds import MAX_CHUNK, MAX_HOLLOW, MAX_METADATA
 from ..errors import BagError
 from ..files import read_file
 from .mcap import mcap_messages
@@ -18,16 +18,29 @@ def storage_files(folder: Path) -> list[Path]:
     A single MCAP file, as pages and other tools write it, is a bag too.
 
     Raises:
-        BagError: a file is a link, as an untrusted bag could name any file of this machine, or a pipe or device.
+        BagError: a file is a link, as an untrusted bag could name any file of this machine, a pipe or device, or almost
+            without content.
     """
     if folder.suffix == ".mcap" and folder.is_file():
+        _check_content(folder)
         return [folder]
+    for path in folder.iterdir():
+        if path.suffix.startswith((".mcap", ".db3")):  # also .db3-wal, which is copied
+            _check_content(path)
     named = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")]
     if link := next((p for p in named if p.is_symlink()), None):
         raise BagError(f"'{link}' is a link, and links in a bag are not followed; copy the file")
     if odd := next((p for p in named if not (p.is_file() or p.is_dir())), None):
         raise BagError(f"'{odd}' is not a regular file; remove it from the bag")
     return sorted(filter(Path.is_file, named), key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
+
+
+def _check_content(path: Path) -> None:
+    """Refuse a sparse file: a few bytes can have a terabyte of zeros."""
+    state = path.lstat()
+    used = 512 * state.st_blocks  # 0 on file systems without blocks
+    if state.st_size > MAX_CHUNK + MAX_HOLLOW * used and (used or "-" in path.suffix):
+        raise BagError(f"'{path}' is damaged: of its {state.st_size} bytes only {used} are on the disk")
 
 
 def stated_count(folder: Path) -> int | None:

@@ -23,7 +23,7 @@ from .reader import read_bag, whole_bag
 from .recording import Array, Recording
 from .recovery import copy_messages
 
-PART = 10_000  # rows of a CSV file that are written at a time
+PART = 100_000  # cells of a CSV file that are written at a time
 ENDINGS = (".csv", ".parquet", ".mcap", ".lerobot")
 
 
@@ -81,11 +81,12 @@ def _columns(run: Recording) -> dict[str, tuple[str, Array]]:
 
 def _csv(columns: dict[str, tuple[str, Array]]) -> Iterator[bytes]:
     rows: Iterable[Sequence[object]] = [[f"{name} [{unit}]" if unit else name for name, (unit, _) in columns.items()]]
-    for k in count(0, PART):
+    part = max(1, PART // len(columns))
+    for k in count(0, part):
         file = io.StringIO()
         csv.writer(file, lineterminator="\n").writerows(rows)
         yield file.getvalue().encode()
-        rows = np.column_stack([values[k : k + PART] for _, values in columns.values()]).tolist()  # shortest exact text
+        rows = np.column_stack([values[k : k + part] for _, values in columns.values()]).tolist()  # shortest exact text
         if not rows:
             return
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_SAMPLES, MIB
+from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
 from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
@@ -118,14 +118,17 @@ def _read(
     """Read a bag's joint states with the given accumulator, and downsample them."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states, total = "", kind(path), 0
-    budget, thinned = ReadBudget(), False
+    budget, thinned, most = ReadBudget(), False, MAX_SAMPLES
 
     def thin(downsampler: Downsampler) -> None:
         states.keep(downsampler.choose(_recording(path, counts, chosen, states, targets)))
 
     folder, prefix, others = _place(path)
     with _refusing(folder):
-        for file in whole_bag(folder):
+        files = whole_bag(folder)
+        if downsampler is None:  # a bag of a few MB may unpack to gigabytes
+            most = min(most, MAX_DRAWN + MAX_SAMPLES_RATIO * sum(file.stat().st_size for file in files))
+        for file in files:
             for channel, stamps, messages in read_messages(file, budget):
                 total += len(stamps)
                 if not _is_within(channel.topic, prefix, others):
@@ -137,6 +140,9 @@ def _read(
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamps, messages)
+                        if states.size > most:
+                            much = f"{most // MIB} MiB of joint states"
+                            raise BagError(f"'{path}' unpacks to more than {much}; cut it into several bags")
                         if downsampler is not None:
                             downsampler.most = min(downsampler.most, MAX_DRAWN * len(states) // states.size)
                             if len(states) > downsampler.most:
@@ -217,9 +223,6 @@ class _JointStates:
         self._stamps.frombytes(stamps.tobytes())
         for stored, part in zip(self._numbers, numbers, strict=True):
             stored.frombytes(part.tobytes())
-        if self.size > MAX_SAMPLES:
-            most = f"{MAX_SAMPLES // MIB} MiB"
-            raise BagError(f"'{self._path}' has more than {most} of joint states; cut it into several bags")
 
     def __len__(self) -> int:
         return len(self._stamps)

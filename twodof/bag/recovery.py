@@ -80,7 +80,9 @@ def recover(path: str | Path) -> Recovered:
             sync(folder.parent)
     except BlockingIOError as error:
         raise BagError(f"the bag '{bag}' is still being written, or recovered") from error
-    except (OSError, sqlite3.Error, WriterError, RecursionError) as error:  # RecursionError: of nested folders
+    except RecursionError as error:
+        raise BagError(f"'{bag}' has folders that are nested too deeply; move them out of the bag") from error
+    except (OSError, sqlite3.Error, WriterError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise BagError(f"cannot recover the bag '{bag}': {reason}; nothing is lost") from error
     return Recovered(bag, original, counts, damage)
