@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..version import install
@@ -31,7 +32,7 @@ def add(fit: Parser) -> None:
         help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
         " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
     )
-    text = "without bags: write a motion of S seconds as a CSV, whose recording tells most about the free parameters"
+    text = "without bags: write a motion of S seconds as a CSV, from whose recording a fit is most precise"
     option("--design", type=float, metavar="S", help=text)
     add_output(fit, "FOLDER|CSV", "folder of the fitted robot (fitted), or file of the motion (excite.csv)")
     text = "link of the payload (the last link, if there is only one)"
@@ -71,14 +72,12 @@ def call(options: argparse.Namespace) -> int:
     print_table(*result.rows)
     for remark in result.remarks:
         say(f"note: {remark}")
-    given = {name: ",".join(map(repr, values)) for name, values in result.settings.items()}
-    settings = "".join(
-        f" --gravity {value.replace(',', ' ')}" if name == "gravity" else f" --set {name}={value}"
-        for name, value in given.items()
-    )
+    given = {name: ",".join(map(repr, values)) for name, values in result.settings.items() if name != "gravity"}
+    settings = "".join(f" --set {name}={value}" for name, value in given.items())
+    same = _same(options, result.settings.get("gravity"))
     page = output / "fit.html"
     say(f"page: {page}" if page.exists() else f"no page: {install('view')}")
-    print_next(f"twodof build {quote(output / 'robot.urdf')}{_same(options)}{settings}")
+    print_next(f"twodof build {quote(output / 'robot.urdf')}{same}{settings}")
     return 0
 
 
@@ -96,16 +95,16 @@ def _design(options: argparse.Namespace) -> int:
     gain = f"intervals {result.factor:.3g} times narrower than with random motions within the same limits"
     say(f"motion: {output}, {gain}")
     say("note: collisions are not checked: look at the motion in a simulation before a robot follows it")
-    start = ",".join(f"{q:.9g}" for q in result.q[0])
+    start, same = ",".join(f"{q:.9g}" for q in result.q[0]), _same(options, options.gravity)
     print_next(
-        f"twodof build {quote(options.robot)}{_same(options)} --control joint --set q_start={start} -o Robot.fmu",
+        f"twodof build {quote(options.robot)}{same} --control joint --set q_start={start} -o Robot.fmu",
         f"twodof run Robot.fmu --input {quote(output)} --stop-time {options.design:g} --step {FINE:g} --effort",
     )
     return 0
 
 
-def _same(options: argparse.Namespace) -> str:
+def _same(options: argparse.Namespace, gravity: Sequence[float] | None) -> str:
     """Return the options that a build of the same robot needs."""
     same = "".join(f" --lock {quote(lock)}" for lock in options.locks or ())
     same += f" --frame {quote(options.frame)}" if options.frame else ""
-    return same + (f" --gravity {' '.join(map(repr, options.gravity))}" if options.gravity else "")
+    return same + (f" --gravity {' '.join(map(repr, gravity))}" if gravity else "")

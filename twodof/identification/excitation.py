@@ -1,4 +1,4 @@
-"""Design of an experiment: a motion within a robot's limits that tells most about free parameters.
+"""Design of an experiment: a motion within a robot's limits from which a fit is most precise.
 
 Each joint follows a Fourier series, and begins and ends at rest in the middle of its range, without acceleration:
 
@@ -179,7 +179,7 @@ def excite(
     progress: Callable[[int, int], None] | None = None,
     **options: Unpack[ModelOptions],
 ) -> Excitation:
-    """Return a motion whose recording tells most about free parameters, within the limits of the URDF.
+    """Return a motion within the limits of the URDF from whose recording a fit is most precise.
 
     Collisions are not considered. The design is the same on each call.
 
