@@ -134,7 +134,7 @@ def test_plot_of_a_sweep_prints_the_best_runs(grid_sweep, tmp_path, capsys, monk
     assert "plot  whole.png" in out and (tmp_path / "whole.png").stat().st_size > 20_000
     table = table_of(grid_sweep)
     best = table.sort_values(["settling_time", "peak_effort"]).iloc[0]
-    assert "best: settled first, with least effort" in out
+    assert "best: by settling time, then by peak effort" in out
     row = out.splitlines()[5].split()
     assert [float(cell) for cell in row[:4]] == pytest.approx(
         [best["run"], best["Kp"], best["Kd"], best["settling_time"]]
@@ -149,7 +149,7 @@ def test_where_no_run_settles_the_best_is_another(native_path, tmp_path, capsys)
     sweep(native_path, grid={"Kp": [20.0, 60.0]}, stop_time=0.05, output=tmp_path / "s")
     assert main(["info", str(tmp_path / "s")]) == 0
     out = capsys.readouterr().out
-    assert "best: with least effort, with least error at the end\n" in out
+    assert "best: by peak effort, then by final error\n" in out
     assert "settl" not in out.partition("best:")[2]
 
 

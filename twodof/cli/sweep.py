@@ -147,7 +147,7 @@ def print_best(table: DataFrame, cost: Expression | None = None) -> None:
         rows = [[*row, "no" if impossible else "yes"] for row, impossible in zip(rows, beyond)]
         names, units = [*names, "possible"], [*units, ""]
     ranks = [RANKED[name] for name in RANKED if name in best.columns][:2]
-    title = f"best: {', '.join(ranks)}" if ranks else "finished; no metric ranks them"
+    title = f"best: {', then '.join(ranks)}" if ranks else "finished; no metric ranks them"
     if cost is not None:
         title = f"best: least cost, {cost.text}"
     runs = ranked(table, cost)

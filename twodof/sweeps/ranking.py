@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     import pandas
 
 RANKED = {
-    "settling_time": "settled first",
-    "peak_effort": "with least effort",
-    "final_error": "with least error at the end",
-    "final_turn_error": "with least orientation error at the end",
-    "final_joint_error": "with least joint error at the end",
+    "settling_time": "by settling time",
+    "peak_effort": "by peak effort",
+    "final_error": "by final error",
+    "final_turn_error": "by final orientation error",
+    "final_joint_error": "by final joint error",
 }
 """Criteria of the ranking in words; each one breaks ties of the previous ones."""
 USE = ["effort_use", "velocity_use"]
