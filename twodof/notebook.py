@@ -1,4 +1,4 @@
-"""HTML of results for notebooks: a table of facts and a small SVG picture, without scripts. Lines of slow tasks."""
+"""HTML of results for notebooks: a table of facts and a small SVG picture, without scripts. Progress of slow tasks."""
 
 import os
 import sys

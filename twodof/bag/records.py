@@ -1,8 +1,8 @@
 """Record types and limits for untrusted bags.
 
 Every claim of a file is checked: lengths, tables of contents, sizes after decompression. The size of one chunk or
-message bounds memory, and the size of the files bounds time. rosbags does not read files that lack their end, and
-trusts the claims of others.
+message bounds memory, and the size of the files bounds time. rosbags does not read truncated files, and does not check
+complete ones.
 """
 
 import struct

@@ -1,8 +1,9 @@
 """Terms of the derivatives of inverse dynamics as recursions over a robot's joints.
 
-Spatial vectors are in the root's axes about the task frame's origin, whose rounding errors are small for distal joints:
-angular, linear; of forces moment, force. With the unit velocity s of a joint, the velocity v and the acceleration a
-before it, the inertia I and the wrench f of all bodies that the joint moves, and B of their Coriolis forces:
+Spatial vectors are in the root's axes about the task frame's origin, where rounding errors are small for distal joints.
+Motion vectors are (angular, linear), force vectors (moment, force). For each joint, s is its unit velocity, v and a are
+the velocity and the acceleration of the body before it, and I, B and f are the inertia, the Coriolis matrix and the
+wrench of all bodies that it moves:
 
     ψ = v × s,   χ = a × s + v × ψ,                    I = Σ I_k,   B = Σ B_k,   f = Σ (I_k a_k + v_k ×* I_k v_k)
     ∂τ_i/∂q_j = sᵢᵀ (2 B_i ψ_j + I_i χ_j)              ∂τ_j/∂q_i = sⱼᵀ (2 B_i ψ_i + I_i χ_i + sᵢ ×* f_i)

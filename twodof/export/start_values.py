@@ -1,4 +1,4 @@
-"""Start values by name, checked against the variables of an FMU that exists or will be built."""
+"""Start values by name, checked against the variables of an FMU or of a build."""
 
 import re
 from collections.abc import Mapping

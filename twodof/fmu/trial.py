@@ -1,4 +1,4 @@
-"""An FMU that is tried: its default experiment, its runs, and comparisons of their outputs."""
+"""FMU under test: its default experiment, its runs, and comparisons of their outputs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Trials of a co-simulation FMU against requirements of the FMI standard.
 
-Each function has an argument Trial and returns a line with the result. Equal means bit-identical.
+Each function takes a ``Trial`` and returns a line with the result. Equal means bit-identical.
 
 Sources: FMI 2.0.5, sections 2.1 and 4.2; FMI 3.0.2, sections 2.2 and 4.2.
 """

@@ -1,11 +1,11 @@
 """Forward kinematics of a URDF for many samples at a time, for transforms, plots and pages.
 
-    p_child = p_parent + R_parent (xyz + R(rpy) a q),  R_child = R_parent R(rpy)            sliding
-    p_child = p_parent + R_parent xyz,                 R_child = R_parent R(rpy) exp[a q]×  turning
+    p_child = p_parent + R_parent (xyz + R(rpy) a q),  R_child = R_parent R(rpy)            prismatic
+    p_child = p_parent + R_parent xyz,                 R_child = R_parent R(rpy) exp[a q]×  revolute
 
 a is the joint's axis. A column of the Jacobian of a point p is
 
-    a                  sliding,        a × (p − p_child)        turning
+    a                  prismatic,      a × (p − p_child)        revolute
 
 with a in the root's axes. Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 2.8 and 3.1.
 """

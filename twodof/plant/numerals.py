@@ -1,4 +1,4 @@
-"""Numbers in text as other programs read them."""
+"""Parse numbers in text by the rules that other programs apply."""
 
 
 def number(word: str) -> float:

@@ -3,7 +3,7 @@
     τ = M(q) q̈_cmd + h(q, v)                                    inverse dynamics (RNEA)
     q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v) + λ)     forward dynamics (ABA)
 
-A law of efforts gives τ itself. λ is the effort of friction and stops (``stops``). M and h include the payload in
+Under effort control, τ is an input. λ is the effort of friction and stops (``stops``). M and h include the payload in
 forward dynamics, and in inverse dynamics only with ``payload_known``. M includes the armature in both.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; here Pinocchio's.

@@ -1,4 +1,4 @@
-"""Error for a communication step that the integrator cannot do; it names the joint that is too fast."""
+"""Error for a communication step that the integrator cannot complete; it names the fastest joint."""
 
 from collections.abc import Callable, Sequence
 from itertools import product

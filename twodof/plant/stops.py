@@ -1,8 +1,8 @@
 """Joints at rest at a limit or by friction: the efforts that hold them, and their release.
 
 A stop is plastic and unilateral: a joint that reaches it loses its velocity and rests while it is pressed against it.
-There are two kinds. A clamp has no reaction: the joint rests while its own acceleration points into the limit, and the
-other joints move as if the joint moved on freely, with the friction of a joint that slips into the limit. A rigid stop
+There are two kinds. A clamp has no reaction: the joint rests while its own acceleration points into the limit. The
+other joints move as if this joint moved freely beyond the limit, slipping against its friction. A rigid stop
 acts on all joints, as friction F does. With the unit vectors E of joints at a limit, which point into the range, and
 the efforts λ on joints at rest,
 

@@ -1,4 +1,4 @@
-"""Film of a run, made without a display: the arm moves in its workspace, in the views of the run's figure."""
+"""Film of a run, drawn without a display: the arm in its workspace, in the views of the run's figure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interactive map of a sweep on a page: two maps side by side, a Pareto front, and the run that is clicked.
+"""Interactive map of a sweep on a page: two maps side by side, a Pareto front, and the clicked run.
 
 ``maps.js`` draws them from the table's columns with plotly, whose compressed library is on the page.
 """
