@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -227,3 +229,14 @@ def test_damping_of_a_robot_of_one_joint_is_found(tmp_path):
     result = twodof.fit(urdf, bag_of(tmp_path / "bag", ["hub"], q, 0.1 * a + 0.3 * v), "damping[*]")
     (damping,) = result.parameters
     assert damping.after == pytest.approx(0.3, abs=1e-3)
+
+
+def test_one_of_millions_of_wrong_values_is_named_without_a_list_of_all() -> None:
+    wrong = np.full((300_000, 2), np.nan)
+    parts: Any = SimpleNamespace(path="bag", joints=("a", "b"), q=wrong, tau=wrong, t=np.arange(300_000.0))
+    tracemalloc.start()
+    with pytest.raises(InputError, match="'bag': the position of joint 'a' at 0 s is not a number"):
+        stretches._columns(parts, parts)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 8 * wrong.nbytes

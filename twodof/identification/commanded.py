@@ -52,16 +52,20 @@ def commanded_efforts(recording: Recording) -> Array:
         given = [v for v in table if v.causality in ("input", "parameter")]
         begins = [k for k, _ in recording.schedule]
         order = [recording.joints.index(joint) for joint in robot.joints]
-        tau = np.zeros_like(recording.q)
-        for side in ("left", "right"):  # before and after a change
-            at = np.maximum(np.searchsorted(begins, recording.steps, side) - 1, 0)
-            for k, (q, v) in enumerate(zip(recording.q[:, order], recording.v[:, order])):
-                if not k or at[k] != at[k - 1]:
-                    _set(plant, given, recording.schedule[at[k]][1])
-                tau[k, order] += 0.5 * np.array(plant.commanded_effort(q, v))
+        before, after = (np.maximum(np.searchsorted(begins, recording.steps, s) - 1, 0) for s in ("left", "right"))
+        q, v, tau = recording.q[:, order], recording.v[:, order], np.zeros((2, *recording.q.shape))
+        last = -1
+        for side, at, rows in ((0, before, range(len(q))), (1, after, np.flatnonzero(before != after).tolist())):
+            tau[1] = tau[0]
+            for k in rows:
+                if at[k] != last:
+                    last = at[k]
+                    _set(plant, given, recording.schedule[last][1])
+                tau[side, k, order] = plant.commanded_effort(q[k], v[k])
     except (KeyError, TypeError, ValueError, DiscardError, RobotError) as error:
         raise InputError(f"'{name}' has no efforts, and its run.json does not tell them: {error}") from error
-    return tau
+    mean: Array = 0.5 * (tau[0] + tau[1])
+    return mean
 
 
 def _set(plant: Plant, variables: Sequence[Variable], values: Mapping[str, Value]) -> None:

@@ -168,7 +168,7 @@ def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
     order = [own.index(joint) for joint in robot.joints]
     q, tau = recording.q[:, order], recording.tau[:, order]
     for values, what in ((q, "position"), (tau, "effort")):
-        if bad := np.argwhere(~(np.abs(values) <= MAX_VALUE)).tolist():
+        if bad := np.argwhere(~(np.abs(values) <= MAX_VALUE))[:1].tolist():
             k, i = bad[0]
             where = f"joint '{robot.joints[i]}' at {recording.t[k]:g} s"
             fault = f"beyond {MAX_VALUE:g}" if np.isfinite(values[k, i]) else "not a number"
