@@ -94,6 +94,8 @@ def test_mcap_of_more_topics_than_are_read_is_refused(bag, capsys):
     topics = b"".join(channel(i, f"/t{i}") for i in range(2, 1002))
     (bag / "bag.mcap").write_bytes(TOPIC + topics + FOOTER)
     assert "has more than 1000 topics" in refused(capsys, bag)
+    (bag / "bag.mcap").write_bytes(TOPIC + channel(2, "/t" * 10**6) + FOOTER)
+    assert "has a topic with a name of more than 1000 characters" in refused(capsys, bag)
 
 
 COUNT = "WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c)"
@@ -105,6 +107,10 @@ DATABASES = {
         f"CREATE VIEW messages AS {COUNT} SELECT n AS id, 1 AS topic_id, n AS timestamp,"
         " zeroblob(1000) AS data FROM c",
         "has views, triggers or virtual tables",
+    ),
+    "a topic with a long name": (
+        "UPDATE topics SET name = '/' || hex(zeroblob(1000000))",
+        "has a topic with a name of more than 1000 characters",
     ),
     "a view of topics": (
         "DROP TABLE topics;"

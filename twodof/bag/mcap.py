@@ -13,9 +13,9 @@ from zlib import crc32
 import lz4.frame
 import numpy as np
 
-from ..bounds import MAX_CHUNK, MAX_LOOSE, MAX_PROVENANCE, MAX_RATIO, MAX_TOPICS
+from ..bounds import MAX_CHUNK, MAX_LOOSE, MAX_PROVENANCE, MAX_RATIO
 from ..ros.cdr import Rows
-from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, refusing_damage
+from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, add_channel, refusing_damage
 
 if sys.version_info >= (3, 14):
     from compression import zstd as zstd
@@ -151,9 +151,7 @@ class Tables:
         entries = _entries(content[position : position + length])
         name, text = self._schemas[schema]
         qos, hashed = entries.get("offered_qos_profiles", ""), entries.get("topic_type_hash", "")
-        self.channels[number] = Channel(topic, name, encoding, text, qos, hashed)
-        if len(self.channels) > MAX_TOPICS:
-            raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
+        add_channel(path, self.channels, number, Channel(topic, name, encoding, text, qos, hashed))
 
     def batch(self, path: Path, rows: Rows) -> Batch:
         """Return the messages of records with the same channel and length."""

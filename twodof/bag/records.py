@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_CHUNK, MAX_RATIO
+from ..bounds import MAX_CHUNK, MAX_NAME, MAX_RATIO, MAX_TOPICS
 from ..ros.cdr import Rows
 
 RECORD = 2000  # bytes of budget for a record; a packed message takes at least 3 bytes of a file
@@ -42,6 +42,15 @@ class Batch(NamedTuple):
     channel: Channel
     stamps: Stamps
     messages: Rows
+
+
+def add_channel(file: Path, channels: dict[int, Channel], number: int, channel: Channel) -> None:
+    """Add a topic of a file to those known, by number; raise DamageError for too many, or for a long name."""
+    channels[number] = channel
+    if len(channels) > MAX_TOPICS:
+        raise DamageError(f"'{file.name}' has more than {MAX_TOPICS} topics")
+    if len(channel.topic) + len(channel.type) > MAX_NAME:
+        raise DamageError(f"'{file.name}' has a topic with a name of more than {MAX_NAME} characters")
 
 
 class DamageError(Exception):

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..bounds import MAX_TOPICS, MIB
+from ..bounds import MIB
 from ..files import temporary_folder
-from .records import Batch, Channel, DamageError
+from .records import Batch, Channel, DamageError, add_channel
 
 PLAIN = ("CREATE TABLE ", "CREATE INDEX ")  # beginnings of SQLite's schema records of plain tables
 TABLES = {  # ROS 2's tables and their columns; older versions lack the last ones
@@ -93,15 +93,13 @@ def _unfinished(path: Path) -> list[Path]:
 
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
     definitions = {row[1]: row[3] for row in _rows(path, database, "message_definitions")}
-    channels = {}
+    channels: dict[int, Channel] = {}
     for number, topic, kind, serialization, qos, digest in _rows(path, database, "topics"):
         definition = definitions.get(kind, "")
         channel = Channel(topic, kind, serialization, definition, qos or "", digest or "")
         if not all(isinstance(text, str) for text in channel):
             raise DamageError(f"'{path.name}' is damaged")
-        channels[number] = channel
-        if len(channels) > MAX_TOPICS:
-            raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
+        add_channel(path, channels, number, channel)
     return channels
 
 
