@@ -19,6 +19,7 @@ from systems import NAMESPACES, WIRES, component, connection, connectors, loop, 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import FmuError, InputError
+from twodof.fmu import ssp_file
 
 H, N = 0.01, 50
 TARGET = np.array([0.3, 0.2])
@@ -563,6 +564,17 @@ def test_invalid_systems_are_refused_at_once(
         twodof.load_fmu(system)
     assert time.process_time() - begun < 5.0
     assert [*tmp_path.iterdir()] == [system]
+
+
+def test_the_fmus_of_a_system_have_a_limited_size(
+    plant: bytes, pd: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = loop(tmp_path / "loop.ssp", plant, pd)
+    monkeypatch.setattr(ssp_file, "MAX_FMUS", len(plant) + len(pd))
+    twodof.load_fmu(system)
+    monkeypatch.setattr(ssp_file, "MAX_FMUS", len(plant) + len(pd) - 1)
+    with pytest.raises(FmuError, match="its FMUs have more than 0 MiB together"):
+        twodof.load_fmu(system)
 
 
 def test_an_fmu_that_is_a_link_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:

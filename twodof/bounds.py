@@ -17,6 +17,7 @@ MAX_NAME = 1000  # characters of the name of a variable, component or topic
 MAX_DIMENSIONS = 16  # dimensions of an array of FMI 3.0; a matrix has 2
 MAX_COMPONENTS = 100  # FMUs and systems in a system, and connections in a row
 MAX_DESCRIPTIONS = 16 * MIB  # descriptions of all components of a system
+MAX_FMUS = 512 * MIB  # all FMUs of a system, which a check reads several times
 MAX_VARIABLES = 200_000  # variables of all components of a system
 MAX_WIRING = 1_000_000  # connections that the values of a system pass in all, and direct dependencies of its outputs
 MAX_RESOURCE = 256 * MIB

@@ -21,7 +21,7 @@ import fmpy.ssp
 import lxml.etree
 from fmpy.model_description import DefaultExperiment
 
-from ..bounds import MAX_COMPONENTS, MAX_DESCRIPTION, MAX_NAME
+from ..bounds import MAX_COMPONENTS, MAX_DESCRIPTION, MAX_FMUS, MAX_NAME, MIB
 from ..errors import ZIP_ERRORS, FmuError
 from ..files import check_archive, read_member
 from .validation import NUMBERS, TRUE, is_plain_xml
@@ -134,6 +134,9 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
                 raise FmuError(
                     f"'{path}': two elements have the name '{twice}', with that of their systems; rename one"
                 )
+            sources = {element.source for element in system.walk() if element.source}
+            if sum(archive.getinfo(source).file_size for source in sources) > MAX_FMUS:
+                raise FmuError(f"'{path}': its FMUs have more than {MAX_FMUS // MIB} MiB together")
             default = root.find(f"{SSD}DefaultExperiment")
             times = {} if default is None else default.attrib
             experiment = DefaultExperiment(startTime=times.get("startTime"), stopTime=times.get("stopTime"))
