@@ -228,6 +228,7 @@ def test_the_command_prints_the_model(bare, capsys):
     assert printed["modes"][0]["frequency"] == model.modes[0].frequency
     assert main(["linearise", str(bare), "--at", f"q={UPRIGHT[0]},0"]) == 0
     text = capsys.readouterr().out
+    assert not re.search(r" -0( |$)", text, re.M)
     assert "q[1]        1.5708 rad" in text and "eigenvalue, 1/s" in text
     assert main(["linearise", str(bare), "--at", "q"]) == 2
     assert "--at q: expected NAME=VALUE" in capsys.readouterr().err

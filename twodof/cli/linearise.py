@@ -59,5 +59,5 @@ def _print(model: LinearModel) -> None:
         say(f"\n{name}")
         rows = model.states if name in "AB" else model.outputs
         columns = model.states if name in "AC" else model.inputs
-        values = ((f"{x:.6g}" for x in row) for row in getattr(model, name).tolist())
+        values = ((f"{x + 0.0:.6g}" for x in row) for row in getattr(model, name).tolist())
         print_table(["", *columns], *([row, *texts] for row, texts in zip(rows, values)), align=str.rjust)

@@ -49,12 +49,11 @@ def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 def load(judge: Judge) -> Iterator[Cause]:
     """Yield loads, and the damping of joints, that the controller does not know."""
-    if judge.held.get("payload") and not judge.held.get("payload_known"):
-        yield Cause(
-            "load",
-            f"the controller does not know the payload of {judge.held['payload']:g} kg; set payload_known=true",
-            1.0,
-        )
+    payload, switch = judge.held.get("payload"), "payload_known"
+    own = next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
+    if payload and not (judge.held.get(switch) and judge.held.get(f"{own}payload") == payload):
+        remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
+        yield Cause("load", f"the controller does not know the payload of {payload:g} kg; {remedy}", 1.0)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
