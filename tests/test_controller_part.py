@@ -23,6 +23,7 @@ from tools import needs
 
 import twodof
 from twodof.errors import BuildError
+from twodof.export.split import SSD
 from twodof.fmu import System
 from twodof.fmu.system_instance import instantiate_fmu
 
@@ -248,6 +249,19 @@ def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None
     starts = twodof.load_fmu(ssp).start_values
     assert (starts["controller.control_period"], starts["control_period"]) == (0.01, 0.0)
     assert (starts["controller.payload"], starts["payload"], starts["rigid_stops"]) == (0.1, 0.1, False)
+
+
+def test_a_split_robot_has_a_picture_of_its_components_and_connections(ssp: Path) -> None:
+    """In the documentation, and as the geometry of a diagram, in which components do not overlap."""
+    with zipfile.ZipFile(ssp) as archive:
+        page = archive.read("documentation/index.html").decode()
+        structure = ET.fromstring(archive.read("SystemStructure.ssd"))
+    picture = ET.fromstring(page[page.index("<svg") : page.index("</svg>") + 6])
+    texts = {text.text for text in picture.iter("text")}
+    assert {"controller", "plant", "tau_cmd[1…2]", "q[1…2], v[1…2]"} <= texts
+    boxes = [box.attrib for box in structure.iter(f"{SSD}ElementGeometry")]
+    left, right = sorted((float(box["x1"]), float(box["x2"])) for box in boxes)
+    assert left[0] < left[1] < right[0] < right[1]
 
 
 def test_a_split_robot_is_built_again_byte_by_byte(ssp: Path, fmi: int, tmp_path: Path) -> None:

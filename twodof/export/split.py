@@ -4,10 +4,13 @@ Source: System Structure and Parameterization 1.0, Modelica Association, 2019.
 """
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from html import escape
+from string import Template
 from typing import NamedTuple
 
+from ..files import data_file
 from ..plant.variables import CONTROLS
 from ..version import __version__
 from .composition import compose, fmi_version
@@ -26,6 +29,8 @@ WIRES = (
     ("controller", "tau_cmd", "plant", "tau_cmd"),
 )
 """Connections: component and group of the start, and those of the end."""
+PLACES, WIDTH, HEIGHT = {"controller": 0, "plant": 60}, 40, 20
+"""Left edges of the components in a diagram, and their size, mm."""
 
 
 class Row(NamedTuple):
@@ -75,6 +80,7 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
         tables[name] = {v.get("name", ""): Row.of(v) for v in rows}
     return {
         "SystemStructure.ssd": _structure(options.name, tables),
+        "documentation/index.html": _page(options, len([*_wires(tables)]) // len(WIRES)),
         **{f"resources/{name}.ssv": _values(name, table) for name, table in tables.items()},
     }, fmus
 
@@ -88,12 +94,7 @@ def _structure(title: str, tables: Mapping[str, Mapping[str, Row]]) -> bytes:
     root = ET.Element(f"{SSD}SystemStructureDescription", version="1.0", name=title)
     root.set("generationTool", f"twodof {__version__}")
     system = ET.SubElement(root, f"{SSD}System", name=title)
-    wires = [
-        (start, name, end, name.replace(group, other))
-        for start, group, end, other in WIRES
-        for name in tables[start]
-        if name.partition("[")[0] == group
-    ]
+    wires = [*_wires(tables)]
     elements = ET.SubElement(system, f"{SSD}Elements")
     for part, table in tables.items():
         component = ET.SubElement(elements, f"{SSD}Component", name=part, source=f"resources/{part}.fmu")
@@ -104,6 +105,8 @@ def _structure(title: str, tables: Mapping[str, Mapping[str, Row]]) -> bytes:
             if name in driven or variable.causality == "output":
                 connector = ET.SubElement(connectors, f"{SSD}Connector", name=name, kind=variable.causality)
                 ET.SubElement(connector, f"{SSC}{variable.type}")
+        left = str(PLACES[part])
+        ET.SubElement(component, f"{SSD}ElementGeometry", x1=left, y1="0", x2=str(PLACES[part] + WIDTH), y2=str(HEIGHT))
         bindings = ET.SubElement(component, f"{SSD}ParameterBindings")
         ET.SubElement(bindings, f"{SSD}ParameterBinding", source=f"resources/{part}.ssv")
     connections = ET.SubElement(system, f"{SSD}Connections")
@@ -114,6 +117,21 @@ def _structure(title: str, tables: Mapping[str, Mapping[str, Row]]) -> bytes:
     ET.register_namespace("ssc", SSC[1:-1])
     ET.register_namespace("ssd", SSD[1:-1])
     return xml_text(root)
+
+
+def _wires(tables: Mapping[str, Mapping[str, Row]]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the connections: component and variable of the start, and those of the end."""
+    for start, group, end, other in WIRES:
+        for name in tables[start]:
+            if name.partition("[")[0] == group:
+                yield start, name, end, name.replace(group, other)
+
+
+def _page(options: FmuOptions, joints: int) -> bytes:
+    """Return the system's documentation, with a picture of its components and their connections."""
+    template = Template(data_file("fmu_src", "system.html").read_text("utf-8"))
+    control = escape(CONTROLS[options.control].title.format(frame=options.frame or "the last link"))
+    return template.substitute(name=escape(options.name), joints=joints, control=control, version=__version__).encode()
 
 
 def _values(name: str, table: Mapping[str, Row]) -> bytes:
