@@ -5,6 +5,7 @@ Case i of a kind uses ``random.Random(i)``, so that a failing case runs again by
 
 from __future__ import annotations
 
+import re
 import shutil
 import xml.etree.ElementTree as ET
 import zipfile
@@ -74,6 +75,36 @@ def check_bag(jail: Jail, bag: Path, outcome: Outcome) -> None:
     if outcome.status == 0 or bag.exists():
         assert jail.run("info", bag).status == 0
     assert set(jail.target.iterdir()) <= {bag}
+
+
+# --- SSP files ---
+
+SYSTEM = mutations.member({".*ssd": mutations.xml, ".*ssv": mutations.xml})
+SSP = mutations.several(mutations.container, SYSTEM, SYSTEM, SYSTEM, most=1)
+
+
+@pytest.fixture(scope="module")
+def ssp(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The split default arm, with a conversion of units in one connection and a transformation in another."""
+    path = twodof.build_fmu(tmp_path_factory.mktemp("ssp") / "arm.ssp", twodof.FmuOptions(part="split"))
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    text = members["SystemStructure.ssd"].decode()
+    text, angles = re.subn(r'(name="q\[1\]" kind="input">\s*<ssc:Real) />', r'\1 unit="deg"/>', text)
+    turn = '<ssc:LinearTransformation factor="2" offset="0.1"/></ssd:Connection>'
+    text, turns = re.subn(r'(<ssd:Connection [^>]*startConnector="v\[1\]"[^>]*) />', rf"\1>{turn}", text)
+    assert (angles, turns) == (1, 1)
+    members["SystemStructure.ssd"] = text.encode()
+    return mutations.zip_of(members)
+
+
+def test_mutated_ssp(seed: int, jail: Jail, ssp: bytes) -> None:
+    system = jail.input / "mutated.ssp"
+    system.write_bytes(SSP(Random(seed), ssp))
+    bag = jail.target / "bag"
+    jail.run("info", system)
+    assert list(jail.target.iterdir()) == []
+    check_bag(jail, bag, jail.run("run", system, "--stop-time", "0.05", "-o", bag))
 
 
 # --- URDFs ---
