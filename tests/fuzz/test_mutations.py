@@ -85,17 +85,21 @@ SSP = mutations.several(mutations.container, SYSTEM, SYSTEM, SYSTEM, most=1)
 
 @pytest.fixture(scope="module")
 def ssp(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The split default arm, with a conversion of units in one connection and a transformation in another."""
+    """The split default arm, with a stated unit of one connector and a transformation of one connection."""
     path = twodof.build_fmu(tmp_path_factory.mktemp("ssp") / "arm.ssp", twodof.FmuOptions(part="split"))
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     text = members["SystemStructure.ssd"].decode()
-    text, angles = re.subn(r'(name="q\[1\]" kind="input">\s*<ssc:Real) />', r'\1 unit="deg"/>', text)
+    text, angles = re.subn(r'(name="q\[1\]" kind="input">\s*<ssc:Real) />', r'\1 unit="rad"/>', text)
     turn = '<ssc:LinearTransformation factor="2" offset="0.1"/></ssd:Connection>'
     text, turns = re.subn(r'(<ssd:Connection [^>]*startConnector="v\[1\]"[^>]*) />', rf"\1>{turn}", text)
     assert (angles, turns) == (1, 1)
+    unit = '<ssc:Unit name="rad"><ssc:BaseUnit rad="1"/></ssc:Unit>'
+    text = text.replace("<ssd:DefaultExperiment", f"<ssd:Units>{unit}</ssd:Units><ssd:DefaultExperiment")
     members["SystemStructure.ssd"] = text.encode()
-    return mutations.zip_of(members)
+    path.write_bytes(mutations.zip_of(members))
+    assert twodof.simulate(path, stop_time=0.02).verdict.samples == 3
+    return path.read_bytes()
 
 
 def test_mutated_ssp(seed: int, jail: Jail, ssp: bytes) -> None:
