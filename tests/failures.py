@@ -63,7 +63,7 @@ FAILURES = {
         "ur5", "joint", {"payload": 40.0, "payload_known": True, "limit_effort": True}, ("saturation",), "saturated at"
     ),
     "an unknown load": Failure("ur5", "joint", {"payload": 5.0, "Kp": 20.0}, ("load",), "the payload of 5 kg"),
-    "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
+    "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "not know f_ext = (0, 3, 0) N"),
     "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] (along y) = 0"),
     "a feedforward that stays": Failure(
         "arm", "task", {"xdd_des": (0.0, 1.0)}, ("feedforward",), "xdd_des = (0, 1) is not 0, while the target rests"
@@ -76,7 +76,7 @@ FAILURES = {
         "not know the damping of joints 'joint1', 'joint2'",
     ),
     "too much damping": Failure(
-        "arm", "task", {"Kp": 10.0, "Kd": 200.0}, ("time",), "stop later, or raise Kp, or lower Kd"
+        "arm", "task", {"Kp": 10.0, "Kd": 200.0}, ("time",), "raise Kp, or lower Kd, or stop later"
     ),
     "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp = 20"),
     "no damping of the orientation": Failure(

@@ -145,7 +145,7 @@ export class Verdict {
     return ["q_des", "q_start"].flatMap((group) => session.held(group).flatMap((value, i) => {
       const { prismatic } = joints[i], [low, high] = this.search.limits(i), meant = (value * Math.PI) / 180;
       const fits = meant >= low && meant <= high;
-      const text = `${group}[${i + 1}] = ${short(value)} rad: ${short(value)}°? That is ${short(meant)} rad`;
+      const text = `${group}[${i + 1}] = ${short(value)} rad: ${short(value)}°? ${short(value)}° is ${short(meant)} rad`;
       return !prismatic && Math.abs(value) > 2 * Math.PI && fits ? [cause("degrees", text)] : [];
     }));
   }
@@ -241,7 +241,7 @@ export class Verdict {
     if (payload && values.get("payload_known") !== true) found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, 1));
     for (const group of ["tau_ext", "f_ext"])
       if (session.held(group).some(Boolean))
-        found.push(cause("load", `${group} = (${session.held(group).map(short).join(", ")}) acts, which the controller does not know`, 0.5));
+        found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, 0.5));
     /** @type {(own: (damping: number, i: number) => boolean) => string[]} */
     const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
     const heavy = damped((size, i) => size > 2 * this.joints[i].damping), some = damped((size) => size > 0);

@@ -78,7 +78,7 @@ def _degrees(judge: Judge) -> Iterator[Cause]:
         for i, (value, joint) in enumerate(zip(judge.given(group), setup.joints)):
             fits = setup.low[i] - AT_LIMIT <= radians(value) <= setup.high[i] + AT_LIMIT
             if setup.units[i] == "rad" and abs(value) > LEAST_TURN and fits:
-                text = f"{group}[{i + 1}] = {value:g} rad: {value:g}°? That is {radians(value):.4g} rad"
+                text = f"{group}[{i + 1}] = {value:g} rad: {value:g}°? {value:g}° is {radians(value):.4g} rad"
                 yield Cause("degrees", text, 1.0, joint)
 
 
@@ -133,9 +133,14 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("reach", text, best.angle, point=tuple(best.point.tolist()))
 
 
+def _begin(judge: Judge, count: int) -> int:
+    """Return the index of the first of ``count`` samples that counts: in the last quarter, or 0 for a moving target."""
+    return 0 if judge.changes > MANY_CHANGES else max(0, count - (count // 4 + 1))
+
+
 def _late(judge: Judge, inside: NDArray[np.bool_]) -> float:
-    """Return the share of samples at which a condition holds: of the last quarter, or of all for a moving target."""
-    return float(inside[0 if judge.changes > MANY_CHANGES else -(len(inside) // 4 + 1) :].mean())
+    """Return the share of the samples from ``_begin`` on at which a condition holds."""
+    return float(inside[_begin(judge, len(inside)) :].mean())
 
 
 def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -214,7 +219,7 @@ def _singular(judge: Judge) -> Iterator[Cause]:
     sigma = np.linalg.svd(setup.kinematics.jacobian(setup.frame, q)[:, rows], compute_uv=False)
     ratio = sigma[:, -1] / np.maximum(sigma[:, 0], 1e-300)
     near = max(NEAR_SINGULAR, 2.0 * float(setup.starts.get("rcond", 0.0)))
-    k = int(ratio.argmin())
+    k, late = int(ratio.argmin()), _begin(judge, len(ratio)) + int(ratio[_begin(judge, len(ratio)) :].argmin())
     if _late(judge, ratio <= near) > OFTEN:
-        text = f"the arm is near a singularity: its singular values have the ratio {ratio[k]:.2g} at {t[k]:.4g} s"
+        text = f"the arm is near a singularity: its singular values have the ratio {ratio[late]:.2g} at {t[late]:.4g} s"
         yield Cause("singularity", text, 1.0 - float(ratio[k]), time=float(t[k]))

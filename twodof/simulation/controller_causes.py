@@ -65,7 +65,7 @@ def load(judge: Judge) -> Iterator[Cause]:
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
         if values.any():
-            yield Cause("load", f"{group} = {point_text(values)}{unit} acts, which the controller does not know", 0.5)
+            yield Cause("load", f"the controller does not know {group} = {point_text(values)}{unit}", 0.5)
 
 
 def _drags(judge: Judge) -> bool:
@@ -112,7 +112,8 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
             text = f"{gains} for control_period = {period:g} s{late}: the loop is unstable"
             text += f", an error doubles in {period * log(2.0) / log(radius):.2g} s"
             below = stable_gains(p, d, period, delay, differences=differences)
-            text += f"; it is stable below {stiff} = {below[0]:.3g}, {damp} = {below[1]:.3g}" * any(below)
+            best = f"it is stable below {stiff} = {below[0]:.3g} with {damp} = {below[1]:.3g}"
+            text += f"; at the same damping ratio {best}" * any(below)
             yield Cause("unstable", text, log(radius))
 
 
@@ -161,4 +162,4 @@ def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
             ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
             remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > OVERDAMPED else "raise the gains"
-            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or {remedy}", left)
+            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; {remedy}, or stop later", left)

@@ -6,12 +6,14 @@ from math import inf
 import numpy as np
 
 from .cause import FLOOR, Cause, point_text
-from .judge import AT_LIMIT, Judge
+from .judge import AT_LIMIT, SMALLEST_MOVE, Judge
 
 STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
 MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
 RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
+NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
 UNITS = {"x": "m"}  # of errors, rad for the others
+ERRORS = {"x": "position", "quat": "orientation", "q": "joints"}
 SWITCHES = ("payload_known", "limit_effort")
 CONTROLLER = {
     "Kp": "",
@@ -40,7 +42,14 @@ def lines_of(
     also = [f"also {cause.text}" for cause in causes[1:] if not cause.noted]
     notes = [f"note: {cause.text}" for cause in causes[1:] if cause.noted and why[0].kind not in RUNAWAY]
     settings = _settings(judge) if outcome.startswith("not") else ""
-    lines = [head, *also, *notes, _response(judge, outcome, motion, numbers, why), _peaks(judge, why), settings]
+    lines = [
+        head,
+        *also,
+        *notes,
+        _response(judge, outcome, motion, numbers, why),
+        _peaks(judge, why, outcome),
+        settings,
+    ]
     return tuple(filter(None, lines))
 
 
@@ -91,10 +100,12 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
         firsts = [f"{aim.first:.3g} {UNITS.get(name, 'rad')}" for name, aim in judge.aims.items()]
-        late = f"not within 2 % of the first error of {' and '.join(firsts)}"
-        within = f"within 2 % {'only from' if outcome == 'not reached' else 'after'} {settling:.4g} s"
-        parts.append(late if settling == inf else within + " on" * (outcome == "not reached"))
-        if "overshoot" in numbers:
+        late = f"not within 2 % of the initial error of {' and '.join(firsts)}"
+        moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
+        only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
+        within = only if outcome == "not reached" else f"within 2 % after {settling:.4g} s"
+        parts.append(late if settling == inf else within)
+        if "overshoot" in numbers and (numbers["overshoot"] or outcome == "reached"):
             past = numbers["overshoot"]
             name, aim = next(iter(judge.aims.items()))
             far = f"the target is passed by {past * aim.first:.3g} {UNITS.get(name, 'rad')}"
@@ -126,11 +137,12 @@ def _rest(judge: Judge, outcome: str) -> str:
     return f"at rest with {names} at {'a limit' if at.sum() == 1 else 'their limits'}" if names else ""
 
 
-def _peaks(judge: Judge, why: tuple[Cause, ...]) -> str:
+def _peaks(judge: Judge, why: tuple[Cause, ...], outcome: str) -> str:
     """Return the peaks in words, as fractions of the URDF's limits; the causes have those beyond."""
     texts, named = [], {cause.kind for cause in why}
+    least = NEAR if outcome.startswith("not") else 0.0
     for kinds, what, use in zip(({"effort", "saturation"}, {"velocity"}), ("effort", "speed"), judge.use()):
-        if use.max(initial=0.0) > 0.0 and not kinds & named:
+        if use.max(initial=0.0) > least and not kinds & named:
             worst = int(use.argmax())
             texts.append(f"peak {what} {100.0 * use[worst]:.3g} % of the limit of joint '{judge.setup.joints[worst]}'")
     return ", ".join(texts)
