@@ -256,9 +256,10 @@ def test_a_split_robot_has_a_picture_of_its_components_and_connections(ssp: Path
     with zipfile.ZipFile(ssp) as archive:
         page = archive.read("documentation/index.html").decode()
         structure = ET.fromstring(archive.read("SystemStructure.ssd"))
-    picture = ET.fromstring(page[page.index("<svg") : page.index("</svg>") + 6])
-    texts = {text.text for text in picture.iter("text")}
-    assert {"controller", "plant", "tau_cmd[1…2]", "q[1…2], v[1…2]"} <= texts
+    tree = ET.fromstring(page[page.index("<body>") : page.index("</html>")])
+    texts = {text.text for text in tree.iter("text")}
+    rows = [[cell.text for cell in row] for row in tree.iter("tr")]
+    assert {"controller", "plant", "effort", "q, v"} <= texts and ["plant.q", "controller.q"] in rows
     boxes = [box.attrib for box in structure.iter(f"{SSD}ElementGeometry")]
     left, right = sorted((float(box["x1"]), float(box["x2"])) for box in boxes)
     assert left[0] < left[1] < right[0] < right[1]

@@ -27,8 +27,9 @@ def documentation(
     for v in table:
         cells = v.name, v.causality, v.unit, "" if v.start is None else v.start, v.description
         rows.append("".join(["<tr>", *(f"<td>{html.escape(str(c))}</td>" for c in cells), "</tr>"]))
-    page = Template(_shipped("documentation.html").decode()).substitute(
-        name=options.name,
+    index = page(
+        "documentation.html",
+        options.name,
         robot=html.escape(robot.name),
         frame=frame,
         axes=", ".join(robot.axes),
@@ -40,21 +41,35 @@ def documentation(
         variables="\n".join(rows),
         fmi=flavour.fmi,
         kinds="co-simulation and Model Exchange" if flavour.native else "co-simulation",
-        limitations="" if flavour.native else _shipped("limitations.html").decode(),
+        limitations="" if flavour.native else _shipped("limitations.html"),
         version=__version__,
         guid=guid,
         urdf_digest=hashlib.sha256(urdf.encode()).hexdigest(),
     )
-    files = {"index.html": page.encode(), "licenses/license.txt": data_file("LICENSE").read_bytes()}
+    files = {"index.html": index, "licenses/license.txt": data_file("LICENSE").read_bytes()}
     if flavour.native:
         files["externalDependencies.txt"] = NO_DEPENDENCIES
     else:
-        files["externalDependencies.txt"] = _shipped("externalDependencies.txt")
+        files["externalDependencies.txt"] = _shipped("externalDependencies.txt").encode()
         theirs = importlib.metadata.files("pythonfmu") or []
         licence = next(file for file in theirs if file.name.upper().startswith("LICEN"))
         files["licenses/pythonfmu.txt"] = licence.read_binary()
     return {f"documentation/{name}": content for name, content in files.items()}
 
 
-def _shipped(name: str) -> bytes:
-    return data_file("fmu_src", name).read_bytes()
+def page(body: str, name: str, *, controller: str = "inside", plant: str = "inside", **values: object) -> bytes:
+    """Return a page of documentation: a shipped body with the picture of controller and plant, in the common frame.
+
+    Args:
+        body: file name of the body, a template of values, HTML.
+        name: the page's title.
+        controller, plant: "inside" or "outside" of the documented FMU or system.
+        values: values of the body.
+    """
+    loop = Template(_shipped("loop.html")).substitute(controller=controller, plant=plant)
+    filled = Template(_shipped(body)).substitute(values, name=name, loop=loop)
+    return Template(_shipped("frame.html")).substitute(name=name, body=filled).encode()
+
+
+def _shipped(name: str) -> str:
+    return data_file("fmu_src", name).read_text("utf-8")

@@ -7,13 +7,12 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from html import escape
-from string import Template
 from typing import NamedTuple
 
-from ..files import data_file
 from ..plant.variables import CONTROLS
 from ..version import __version__
 from .composition import compose, fmi_version
+from .documentation import page
 from .flavours import Files
 from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
@@ -129,9 +128,10 @@ def _wires(tables: Mapping[str, Mapping[str, Row]]) -> Iterator[tuple[str, str, 
 
 def _page(options: FmuOptions, joints: int) -> bytes:
     """Return the system's documentation, with a picture of its components and their connections."""
-    template = Template(data_file("fmu_src", "system.html").read_text("utf-8"))
     control = escape(CONTROLS[options.control].title.format(frame=options.frame or "the last link"))
-    return template.substitute(name=escape(options.name), joints=joints, control=control, version=__version__).encode()
+    rows = [f"<tr><td>{start}.{own}</td><td>{end}.{other}</td></tr>" for start, own, end, other in WIRES]
+    wires = "\n".join(rows)
+    return page("system.html", escape(options.name), joints=joints, control=control, wires=wires, version=__version__)
 
 
 def _values(name: str, table: Mapping[str, Row]) -> bytes:

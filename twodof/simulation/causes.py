@@ -5,11 +5,10 @@ from functools import partial
 from math import inf, pi, radians
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT
-from .cause import FLOOR, KINDS, MANY_CHANGES, Cause, point_text
+from .cause import FLOOR, KINDS, Cause, point_text
 from .controller_causes import damping, feedforward, gains, load, sampled, slow
 from .judge import AT_LIMIT, BAND, Judge
 
@@ -133,16 +132,6 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("reach", text, best.angle, point=tuple(best.point.tolist()))
 
 
-def _begin(judge: Judge, count: int) -> int:
-    """Return the index of the first of ``count`` samples that counts: in the last quarter, or 0 for a moving target."""
-    return 0 if judge.changes > MANY_CHANGES else max(0, count - (count // 4 + 1))
-
-
-def _late(judge: Judge, inside: NDArray[np.bool_]) -> float:
-    """Return the share of the samples from ``_begin`` on at which a condition holds."""
-    return float(inside[_begin(judge, len(inside)) :].mean())
-
-
 def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup, q, t = judge.setup, judge.history("q"), judge.history()
     taken = judge.duration / max(1, judge.count - 1)
@@ -153,7 +142,7 @@ def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         for i, (joint, unit) in enumerate(zip(setup.joints, setup.units)):
             rests = abs(first[i] - bound[i]) <= AT_LIMIT and counts[i] >= judge.count - 1
             idle = (judge.wanted("q").size and abs(judge.wanted("q")[i] - bound[i]) <= AT_LIMIT) or joint not in moving
-            if counts[i] and not idle and (missed or not rests) and _late(judge, inside[:, i]) > OFTEN:
+            if counts[i] and not idle and (missed or not rests) and inside[judge.late, i].mean() > OFTEN:
                 held = f"for {counts[i] * taken:.4g} s of {judge.duration:.4g} s"
                 text = f"joint '{joint}' stood at its {side} limit {bound[i]:.4g} {unit} {held}"
                 yield Cause("limit", text, counts[i] / judge.count, joint, float(t[inside[:, i].argmax()]))
@@ -184,7 +173,7 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
     inside = tau >= bounds * (1.0 - EXACT)
     for i, joint in enumerate(setup.joints):
         beyond = judge.effort[i] > bounds[i] * (1.0 + EXACT)
-        if judge.share[i] > OFTEN and not beyond and _late(judge, inside[:, i]) > OFTEN:
+        if judge.share[i] > OFTEN and not beyond and inside[judge.late, i].mean() > OFTEN:
             most = f"{bounds[i]:.4g} {EFFORT_UNITS.get(setup.units[i], '')} for {100 * judge.share[i]:.3g} %"
             payload = judge.held.get("payload")
             load = f", with the payload of {payload:g} kg" if payload else ""
@@ -219,7 +208,8 @@ def _singular(judge: Judge) -> Iterator[Cause]:
     sigma = np.linalg.svd(setup.kinematics.jacobian(setup.frame, q)[:, rows], compute_uv=False)
     ratio = sigma[:, -1] / np.maximum(sigma[:, 0], 1e-300)
     near = max(NEAR_SINGULAR, 2.0 * float(setup.starts.get("rcond", 0.0)))
-    k, late = int(ratio.argmin()), _begin(judge, len(ratio)) + int(ratio[_begin(judge, len(ratio)) :].argmin())
-    if _late(judge, ratio <= near) > OFTEN:
-        text = f"the arm is near a singularity: its singular values have the ratio {ratio[late]:.2g} at {t[late]:.4g} s"
-        yield Cause("singularity", text, 1.0 - float(ratio[k]), time=float(t[k]))
+    late, at = ratio[judge.late], t[judge.late]
+    k = int(late.argmin())
+    if np.mean(late <= near) > OFTEN:
+        text = f"the arm is near a singularity: its singular values have the ratio {late[k]:.2g} at {at[k]:.4g} s"
+        yield Cause("singularity", text, 1.0 - float(late[k]), time=float(at[k]))

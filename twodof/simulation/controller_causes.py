@@ -70,8 +70,7 @@ def load(judge: Judge) -> Iterator[Cause]:
 
 def _drags(judge: Judge) -> bool:
     """Return whether the damping of a joint needs a part of the efforts in the last quarter of the run."""
-    late, damping = slice(-(len(judge.history()) // 4 + 1), None), judge.given("damping")
-    v, tau = (np.abs(judge.history(name)[late]) for name in ("v", "tau"))
+    v, tau, damping = *(np.abs(judge.history(name)[judge.late]) for name in ("v", "tau")), judge.given("damping")
     known = v.shape[1] == tau.shape[1] == len(damping)
     return known and bool((v * damping).max(initial=0.0) > DRAG * tau.max(initial=0.0))
 

@@ -13,6 +13,7 @@ from math import inf, nan, sqrt
 import numpy as np
 
 from ..plant.variables import EXACT as EXACT
+from .cause import MANY_CHANGES
 from .setup import Array, Setup
 
 BAND = 0.02
@@ -263,6 +264,11 @@ class Judge:
     def share(self) -> Array:
         """Share of the samples at which each motor is at its effort limit."""
         return np.asarray(self.saturated / max(1, self.count))
+
+    @property
+    def late(self) -> slice:
+        """Samples of the history by which a state is judged: the last quarter, or all for a moving target."""
+        return slice(0 if self.changes > MANY_CHANGES else -(len(self.history()) // 4 + 1), None)
 
     @property
     def held(self) -> Mapping[str, float]:
