@@ -103,15 +103,15 @@ FAILURES = {
         "ur5",
         "joint",
         {"control_period": 0.04, "Kp": 300.0, "Kd": 50.0, "q_des": (0.4, -0.9, 1.7, 0.5, -1.3, 0.6)},
-        ("sampling",),
-        "too high for control_period = 0.04 s",
+        ("unstable",),
+        "too high for control_period = 0.04 s: the loop is at its limit of stability",
     ),
     "a late controller": Failure(
         "arm",
         "joint",
         {"control_period": 0.004, "control_delay": 0.03, "Kp": 400.0, "q_des": (0.8, 0.65)},
-        ("sampling",),
-        "too high for control_period = 0.004 s, control_delay = 0.03 s",
+        ("unstable",),
+        "too high for control_period = 0.004 s and control_delay = 0.03 s: the loop is close to unstable",
     ),
     "a late controller that throws joints to their limits": Failure(
         "arm",
@@ -162,6 +162,34 @@ FAILURES = {
         },
         ("saturation",),
         "of the time, with the payload of 30 kg",
+    ),
+    "a direction without a gain, and a target just out of reach": Failure(
+        "arm", "task", {"Kp": (0.0, 50.0), "x_des": (0.3, 0.05)}, ("gain", "reach"), "Kp[1] (along x) = 0"
+    ),
+    "a load and a target just out of reach": Failure(
+        "panda", "task", {"payload": 3.0, "x_des": (0.75, 0.5, 0.7)}, ("load", "reach"), "the payload of 3 kg"
+    ),
+    "gains just below the limit of stability": Failure(
+        "arm",
+        "task",
+        {"control_period": 0.01, "control_delay": 0.02, "Kp": 480.0, "Kd": 13.85},
+        ("unstable",),
+        "the loop is close to unstable, an error takes 39 s to 2 %; at the same damping ratio it is quickest with",
+    ),
+    "a self-motion that is damped too strongly": Failure(
+        "panda",
+        "task",
+        {"control_period": 0.05, "Kp": 30.0, "Kd": 11.0, "Kn": 45.0, "x_des": (0.4, 0.2, 0.5)},
+        ("unstable",),
+        "Kn = 45 s⁻¹ is too high for control_period = 0.05 s: the loop of the self-motion is unstable",
+        2.0,
+    ),
+    "an orientation that is damped too strongly": Failure(
+        "panda",
+        "pose",
+        {"control_period": 0.05, "Kp": 40.0, "Kd": 15.0, "x_des": (0.4, 0.1, 0.4), "quat_des": (0.0, 1.0, 0.0, 0.0)},
+        ("unstable",),
+        "Kp_rot = 50 s⁻² and Kd_rot = 40 s⁻¹ are too high for control_period = 0.05 s: the loop is at its limit",
     ),
     "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
     "degrees and a saturated motor": Failure(

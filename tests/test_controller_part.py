@@ -228,6 +228,14 @@ def test_the_verdict_names_the_settings_by_which_a_controller_knows_the_payload(
     assert twodof.simulate(ssp, settings=settings).verdict.outcome == "reached"
 
 
+def test_a_payload_that_only_the_controller_has_is_named(ssp: Path) -> None:
+    settings: dict[str, Any] = {"plant.payload": 0.0, "controller.payload": 1.0, "controller.payload_known": True}
+    head = twodof.simulate(ssp, settings=settings).verdict.lines[0]
+    assert head.endswith("knows a payload of 1 kg, which the plant does not have; set controller.payload=0")
+    cured = twodof.simulate(ssp, settings={**settings, "controller.payload": 0.0}).verdict
+    assert cured.outcome == "reached" and not cured.causes
+
+
 def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None:
     """Each start value goes to its FMU; names are those of the FMU of both."""
     system = twodof.load_fmu(ssp)

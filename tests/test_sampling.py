@@ -12,6 +12,7 @@ import native_models
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.optimize
 import scipy.special
 import scipy.stats
 from harness import wine
@@ -31,7 +32,7 @@ from twodof.plant.plant import Plant
 from twodof.plant.robot import load_robot
 from twodof.plant.sampling import rounded
 from twodof.plant.variables import variable_table
-from twodof.simulation.sampled_loop import spectral_radius, stable_gains
+from twodof.simulation.sampled_loop import quickest_gains, spectral_radius, stable_gains
 
 SLIDER = """<robot name="slider">
   <link name="rail"/>
@@ -109,6 +110,26 @@ def test_the_largest_stable_gains_of_a_late_controller_have_no_phase_margin():
     crossing = np.sqrt((Kd**2 + np.sqrt(Kd**4 + 4.0 * Kp**2)) / 2.0)
     assert np.arctan(crossing * Kd / Kp) == pytest.approx(crossing * (delay + 0.5e-3), rel=1e-3)
     assert stable_gains(900.0, 0.0, 0.01, 0.0) == (0.0, 0.0)
+
+
+def test_a_loop_without_stiffness_has_the_radius_of_its_speed():
+    """v_{k+1} = (1 − Kd T) v_k; the mean of a period before replaces v_k if velocities are differences."""
+    assert spectral_radius(0.0, 45.0, 0.05, 0.0) == pytest.approx(abs(1.0 - 45.0 * 0.05), rel=1e-12)
+    known = np.abs(np.roots([1.0, 0.5 * 45.0 * 0.05 - 1.0, 0.5 * 45.0 * 0.05])).max()
+    assert spectral_radius(0.0, 45.0, 0.05, 0.0, differences=True) == pytest.approx(known, rel=1e-12)
+    assert stable_gains(0.0, 45.0, 0.05, 0.0) == pytest.approx((0.0, 40.0), rel=1e-3)
+    assert quickest_gains(0.0, 45.0, 0.05, 0.0) == pytest.approx((0.0, 20.0), rel=1e-2)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.03])
+@pytest.mark.parametrize(("Kp", "Kd"), [(50000.0, 300.0), (1e6, 900.0)])
+def test_the_quickest_gains_are_those_that_an_optimiser_finds(Kp, Kd, delay):
+    def radius(scale):
+        return spectral_radius(scale**2 * Kp, scale * Kd, 0.01, delay)
+
+    bound = stable_gains(Kp, Kd, 0.01, delay)[1] / Kd
+    best = scipy.optimize.brute(lambda s: radius(s[0]), [(0.01 * bound, bound)], Ns=400).item()
+    assert quickest_gains(Kp, Kd, 0.01, delay) == pytest.approx((best**2 * Kp, best * Kd), rel=2.5e-2)
 
 
 @pytest.mark.parametrize("differences", [False, True])

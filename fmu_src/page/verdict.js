@@ -1,6 +1,6 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
-import { spectralRadius } from "./sampled_loop.js";
+import { GAINS, decay, loops, spectralRadius } from "./sampled_loop.js";
 import { Search, off, solved, squared } from "./search.js";
 
 /** @typedef {import("./robot.js").Robot} Robot */
@@ -21,9 +21,9 @@ const CREEPING = 1e-5; // rad/s or m/s
 const FEWEST = 0.2; // damping ratio below which the damping is insufficient
 const TAIL = 256, FAST = 0.25; // examined last samples, and reversals in the time of a step that are too many
 const MOTION = ["effort", "velocity"], FOLLOWING = ["limit", "saturation", "singularity"], EXPLAINED = 0.1; // as in causes.py
-const UNSTABLE = 1 + 1e-4; // spectral radius
+const BEFORE_REACH = ["degrees", "gain", "feedforward", "unstable", "load", "friction"]; // as in causes.py
+const UNSTABLE = 1 + 1e-4, SPOILT = 0.5; // spectral radius, and rate of decay relative to that of a continuous controller
 const DRAG = 0.02; // effort of damping, relative to the largest effort, that counts
-const GAINS = [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]]; // of position or joints, and of orientation
 
 export class Verdict {
   began = 0; // sample at which the target was changed
@@ -92,7 +92,10 @@ export class Verdict {
     const passing = ({ kind, share, joint }) => kind === "limit" && (share < motors || driven[joint]);
     /** @type {(cause: Cause) => number} */
     const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind);
-    const [root, ...others] = found.sort((a, b) => rank(a) - rank(b) || b.share - a.share), [error] = this.errors(this.session.count - 1);
+    const [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
+    /** @type {(cause: Cause) => number} */
+    const first = ({ kind }) => Number(near && !BEFORE_REACH.includes(kind));
+    const [root, ...others] = found.sort((a, b) => first(a) - first(b) || rank(a) - rank(b) || b.share - a.share);
     const leads = ["degrees", "unstable", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
     for (const each of others) each.noted = passing(each) || MOTION.includes(each.kind) || (leads && FOLLOWING.includes(each.kind));
     const stands = others.some(({ kind, noted }) => kind === "limit" && noted);
@@ -269,10 +272,16 @@ export class Verdict {
       return value ? [`${name} = ${short(value)} ${this.session.variable(name).unit}`] : [];
     }).join(", ");
     const differences = session.values.get("v_from_q") === true;
-    const unstable = GAINS.flatMap(([stiff, damp]) => {
-      const Kd = session.held(damp), radii = session.held(stiff).map((p, i) => spectralRadius(p, Kd[i], period, delay, differences));
-      const i = radii.indexOf(Math.max(...radii));
-      return radii[i] > UNSTABLE ? [cause("unstable", `${this.gain(stiff, i)} and ${this.gain(damp, i)} are too high for ${settings()}: the loop is unstable`)] : [];
+    const loaded = Number(session.values.get("payload") ?? 0) !== 0; // a load lowers the true gains
+    const late = this.picked(0.2).map((k) => this.errors(k));
+    const falls = [0, 1].map((i) => late.every((errors, k) => !k || errors[i] < late[k - 1][i]));
+    const unstable = loops(session, joints.length).flatMap(([stiff, damp, Kp, Kd], k) => {
+      const radii = Kp.map((p, i) => spectralRadius(p, Kd[i], period, delay, differences)), radius = Math.max(...radii);
+      const i = radii.indexOf(radius), rate = -Math.log(radius) / period, gains = [stiff && this.gain(stiff, i), this.gain(damp, i)].filter(Boolean);
+      const slow = stiff && rate < SPOILT * decay(Kp[i], Kd[i]) && -Math.log(BAND) > PATIENCE * rate;
+      const text = `${gains.join(" and ")} ${stiff ? "are" : "is"} too high for ${settings()}: the loop${stiff ? "" : " of the self-motion"} is`;
+      if ((loaded && falls[k]) || !(radius > UNSTABLE || slow)) return [];
+      return [cause("unstable", `${text} ${radius > UNSTABLE ? "unstable" : "close to unstable"}`)];
     });
     if (unstable.length) return unstable;
     const turns = joints.map((_, i) => {

@@ -12,7 +12,7 @@ KINDS = {
     "reach": "the target is out of reach",
     "gain": "a gain of 0",
     "feedforward": "a target that rests, with a target velocity or acceleration",
-    "unstable": "a sampled loop that is unstable",
+    "unstable": "a sampled loop that is unstable or close to it",
     "sampling": "an oscillation as fast as the steps of controller or communication",
     "limit": "a joint at its position limit",
     "friction": "a joint that sticks",

@@ -20,6 +20,8 @@ MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
+BEFORE_REACH = ("diverged", "degrees", "gain", "feedforward", "unstable", "load", "friction")
+# Kinds that precede a target out of reach by less than half of the error at the end.
 EXPLAINED = 0.1  # deviation of the error at the end from the distance out of reach that explains it, relative
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
 
@@ -48,8 +50,11 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     def passing(cause: Cause) -> bool:  # a joint in the way saturates motors no longer
         return cause.kind == "limit" and (cause.share < motors or cause.joint in driven)
 
-    def rank(cause: Cause) -> tuple[int, float]:
-        return order.index("drag" if passing(cause) else cause.kind), -cause.share
+    near = any(cause.point and _excess(judge, cause) > cause.share for cause in found)
+
+    def rank(cause: Cause) -> tuple[bool, int, float]:
+        first = not near or cause.kind in BEFORE_REACH
+        return not first, order.index("drag" if passing(cause) else cause.kind), -cause.share
 
     if not found:
         return ()
@@ -64,11 +69,15 @@ def _leads(root: Cause, cause: Cause, judge: Judge) -> bool:
     """Return whether the root leads to another cause; a target out of reach does if it explains the whole error."""
     if root.kind == "reach" and not root.point:
         return cause.kind == "limit" and cause.joint == root.joint
-    if root.kind == "reach":  # by a distance, or by an angle
-        gap = np.linalg.norm(judge.wanted("x") - np.array(root.point)[judge.setup.rows])
-        error = judge.aims["x" if np.isclose(gap, root.share) else "quat"].last
-        return cause.kind in FOLLOWING and error - root.share <= EXPLAINED * root.share
+    if root.kind == "reach":
+        return cause.kind in FOLLOWING and _excess(judge, root) <= EXPLAINED * root.share
     return cause.kind in FOLLOWING and root.kind in ("degrees", "unstable", "sampling")
+
+
+def _excess(judge: Judge, reach: Cause) -> float:
+    """Return by how much the error at the end exceeds the distance, or the angle, by which a target is out of reach."""
+    gap = np.linalg.norm(judge.wanted("x") - np.array(reach.point)[judge.setup.rows])
+    return judge.aims["x" if np.isclose(gap, reach.share) else "quat"].last - reach.share
 
 
 def _degrees(judge: Judge) -> Iterator[Cause]:

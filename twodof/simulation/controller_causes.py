@@ -1,18 +1,20 @@
 """Causes of a run's failure in the controller: its gains, its sampling, and what it does not know."""
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from math import log, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from .cause import FLOOR, MANY_CHANGES, Cause, point_text
 from .judge import BAND, Judge
-from .sampled_loop import spectral_radius, stable_gains
+from .sampled_loop import quickest_gains, spectral_radius, stable_gains
 
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 OVERDAMPED = 5.0  # damping ratio from which on less damping is quicker
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
+GAINS = (("Kp", "Kd"), ("Kp_rot", "Kd_rot"))
+SPOILT = 0.5  # fraction of the rate of decay of a continuous controller below which the sampling is to blame
 DRAG = 0.02  # effort of damping, relative to the largest effort in the last quarter, that counts
 
 
@@ -51,9 +53,13 @@ def load(judge: Judge) -> Iterator[Cause]:
     """Yield loads, and the damping of joints, that the controller does not know."""
     payload, switch = judge.held.get("payload"), "payload_known"
     own = next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
-    if payload and not (judge.held.get(switch) and judge.held.get(f"{own}payload") == payload):
+    payload, believed = payload or 0.0, judge.held.get(f"{own}payload", 0.0) if judge.held.get(switch) else 0.0
+    if payload and believed != payload:
         remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
         yield Cause("load", f"the controller does not know the payload of {payload:g} kg; {remedy}", 1.0)
+    elif believed != payload:
+        text = f"the controller knows a payload of {believed:g} kg, which the plant does not have; set {own}payload=0"
+        yield Cause("load", text, 1.0)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
@@ -89,31 +95,90 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
     i = int(turns.argmax())
     if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
-        stiff = next((group for group in ("Kp", "Kd") if judge.given(group).any()), "")
-        gains = f"the gains ({stiff} up to {judge.given(stiff).max():g})" if stiff else "the gains"
+        gains = f"the gains{_fastest(judge, *sampling)}"
         gains = gains if judge.aims else "the gains of the controller outside"
         what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
         text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: {gains} are too high"
         yield Cause("sampling", f"{text} for {what}", float(turns[i]), setup.joints[i])
 
 
+class _Loop(NamedTuple):
+    """A sampled loop: its spectral radius, the names of its gains, the index of their elements and their values."""
+
+    radius: float
+    stiff: str
+    damp: str
+    i: int
+    Kp: float
+    Kd: float
+
+
+def _loops(judge: Judge, period: float, delay: float) -> Iterator[_Loop]:
+    """Yield the loops of a sampled controller; that of the self-motion has no Kp, and moves only redundant arms."""
+    setup, differences = judge.setup, bool(judge.setup.starts.get("v_from_q"))
+    redundant = len(setup.rows) + (3 if judge.wanted("quat").size else 0) < len(setup.joints)
+    each = [(stiff, damp, judge.given(stiff), judge.given(damp)) for stiff, damp in GAINS]
+    if redundant and "x" in judge.aims and "Kn" in judge.held:
+        each.append(("", "Kn", np.zeros(1), np.array([judge.held["Kn"]])))
+    for stiff, damp, Kp, Kd in each:
+        for i, (p, d) in enumerate(zip(Kp, Kd)):
+            yield _Loop(spectral_radius(p, d, period, delay, differences=differences), stiff, damp, i, p, d)
+
+
+def _fastest(judge: Judge, period: float, delay: float) -> str:
+    """Return the gains of the least stable sampled loop in parentheses; without a period, the largest gain."""
+    if not period:
+        stiff = next((group for group in ("Kp", "Kd") if judge.given(group).any()), "")
+        return f" ({stiff} up to {judge.given(stiff).max():g})" if stiff else ""
+    loop = max(_loops(judge, period, delay), default=None)
+    return f" ({', '.join(_named(judge, loop))})" if loop is not None else ""
+
+
+def _named(judge: Judge, loop: _Loop, units: Sequence[str] = ("", "")) -> list[str]:
+    """Return the gains of a loop with their names and values."""
+    names = [_gain(judge, name, loop.i) for name in (loop.stiff, loop.damp)] if loop.stiff else ["", loop.damp]
+    return [f"{name} = {value:.6g}{unit}" for name, value, unit in zip(names, (loop.Kp, loop.Kd), units) if name]
+
+
 def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
-    """Yield a cause if the sampled loop is unstable, even while limits hold the joints."""
+    """Yield the worst loop of each kind that is unstable, even while limits hold the joints, or hardly decays."""
+    every = [*_loops(judge, period, delay)]
+    for group, output in (("Kp", "q" if "q" in judge.aims else "x"), ("Kp_rot", "quat"), ("", "")):
+        loop = max((loop for loop in every if loop.stiff == group), default=None)
+        if loop is None or (judge.held.get("payload") and _rate(judge, output) > 0.0):  # a load lowers the true gains
+            continue
+        rate = -log(loop.radius) / period
+        if loop.radius > UNSTABLE:
+            state = f"the loop{'' if group else ' of the self-motion'} is unstable, "
+            state += f"{'an error' if group else 'it'} doubles in {-log(2.0) / rate:.2g} s"
+        elif group and rate < SPOILT * _decay(loop) and log(1.0 / BAND) > rate * (judge.duration - judge.changed):
+            state = f"the loop is close to unstable, an error takes {log(1.0 / BAND) / max(rate, 1e-9):.2g} s to 2 %"
+            state = state if rate > 1e-6 else "the loop is at its limit of stability, errors do not decay"
+        else:
+            continue
+        gains, are = " and ".join(_named(judge, loop, (" s⁻²", " s⁻¹"))), "are" if group else "is"
+        late = f" and control_delay = {delay:g} s" * bool(delay)
+        text = f"{gains} {are} too high for control_period = {period:g} s{late}: {state}"
+        yield Cause("unstable", text + _better(judge, loop, period, delay), -rate)
+
+
+def _better(judge: Judge, loop: _Loop, period: float, delay: float) -> str:
+    """Return the largest stable gains, if the present ones are not, and those whose errors decay the quickest."""
     differences = bool(judge.setup.starts.get("v_from_q"))
-    loop = partial(spectral_radius, period=period, delay=delay, differences=differences)
-    for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
-        pairs = enumerate(zip(judge.given(stiff), judge.given(damp)))
-        radius, i, p, d = max(((loop(*pair), i, *pair) for i, pair in pairs), default=(0.0, 0, 0.0, 0.0))
-        if radius > UNSTABLE:
-            names = [_gain(judge, group, i) for group in (stiff, damp)]
-            gains = f"{names[0]} = {p:g} s⁻² and {names[1]} = {d:g} s⁻¹ are too high"
-            late = f" and control_delay = {delay:g} s" * bool(delay)
-            text = f"{gains} for control_period = {period:g} s{late}: the loop is unstable"
-            text += f", an error doubles in {period * log(2.0) / log(radius):.2g} s"
-            below = stable_gains(p, d, period, delay, differences=differences)
-            best = f"it is stable below {stiff} = {below[0]:.3g} with {damp} = {below[1]:.3g}"
-            text += f"; at the same damping ratio {best}" * any(below)
-            yield Cause("unstable", text, log(radius))
+    find = (stable_gains, quickest_gains)
+    most, best = (each(loop.Kp, loop.Kd, period, delay, differences=differences) for each in find)
+    if not any(most):
+        return ""
+    below, quick = (
+        [f"{name} = {value:.3g}" for name, value in zip((loop.stiff, loop.damp), pair) if name] for pair in (most, best)
+    )
+    stable = f"stable below {' with '.join(below)}, and " if loop.radius > UNSTABLE else ""
+    return f"; {'at the same damping ratio ' * bool(loop.stiff)}it is {stable}quickest with {' and '.join(quick)}"
+
+
+def _decay(loop: _Loop) -> float:
+    """Return the slowest rate of decay of the loop of a continuous controller, 1/s."""
+    return float(-np.roots([1.0, loop.Kd, loop.Kp]).real.max())
 
 
 def _sampling(judge: Judge, i: int) -> Iterator[str]:
@@ -144,21 +209,25 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     """Yield a cause for each output whose error still shrinks, with the remaining time by its rate."""
-    t = judge.history()
     for name in missed:
-        aim = judge.aims[name]
-        size = np.array(judge.error_history(name))
-        k = int(np.searchsorted(t, judge.changed + 0.8 * (judge.duration - judge.changed)))
-        if len(size) < 4 or k >= len(size) - 1 or not 0.0 < size[-1] < size[k] * (1.0 - 1e-6):
-            continue
-        rate = log(size[k] / size[-1]) / (t[-1] - t[k])
-        left = log(max(size[-1] / max(BAND * aim.first, FLOOR), 1.0)) / rate
+        rate, aim = _rate(judge, name), judge.aims[name]
+        left = log(max(aim.last / max(BAND * aim.first, FLOOR), 1.0)) / rate if rate else 0.0
         what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
-        steady = bool((np.diff(size[k:]) < 0.0).all())
-        if steady and left < 1000.0 * judge.duration:
+        if rate and left < 1000.0 * judge.duration:
             late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
             text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
             stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
             ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
             remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > OVERDAMPED else "raise the gains"
             yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; {remedy}, or stop later", left)
+
+
+def _rate(judge: Judge, name: str) -> float:
+    """Return the rate, 1/s, at which an output's error shrinks steadily at the end of the run; else 0."""
+    if name not in judge.aims:
+        return 0.0
+    t, size = judge.history(), np.array(judge.error_history(name))
+    k = int(np.searchsorted(t, judge.changed + 0.8 * (judge.duration - judge.changed)))
+    if len(size) < 4 or k >= len(size) - 1 or not 0.0 < size[-1] < size[k] * (1.0 - 1e-6):
+        return 0.0
+    return log(size[k] / size[-1]) / (t[-1] - t[k]) if (np.diff(size[k:]) < 0.0).all() else 0.0
