@@ -7,6 +7,7 @@ import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from zlib import crc32
 
 import lz4.frame
 import mutations
@@ -117,6 +118,15 @@ def circle(bag: Path) -> None:
     file.write_bytes(pages)
 
 
+def indexed(index: bytes) -> bytes:
+    """An MCAP file of one message, whose summary has an index of chunks; its checksum is right."""
+    content = SCHEMA + CHANNEL + message(nothing(1, 1))
+    body = HEADER + chunk(content, len(content), "")
+    summary = SCHEMA + CHANNEL + index + record(11, struct.pack("<QHIIIIQQI", 1, 1, 1, 0, 0, 100_000, 0, 0, 10), PAIR)
+    foot = struct.pack("<BQQQ", 2, 20, len(body), 0)
+    return body + summary + foot + struct.pack("<I", crc32(foot, crc32(summary))) + b"\x89MCAP0\r\n"
+
+
 def lz4_zeros(size: int) -> bytes:
     packer = lz4.frame.LZ4FrameCompressor()
     parts = [packer.begin(), *(packer.compress(bytes(MIB)) for _ in range(size // MIB))]
@@ -144,6 +154,7 @@ def hollow(size: int, content: bytes) -> Callable[[Path], None]:
     return with_mcap(make)
 
 
+INDEX, PAIR = struct.pack("<QQQQ", 0, 1, 8, 100), struct.pack("<HQ", 1, 1)
 FIELDS = "\n".join(f"float64 a{i}" for i in range(3000))
 ENDLESS = "WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r)"
 HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
@@ -179,6 +190,12 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
         )
     ),
     "a message of 700 MB": with_mcap(lambda: mcap_of(SCHEMA, CHANNEL, message(bytes(700 * MIB)))),
+    "100,000 entries in an index": with_mcap(
+        lambda: indexed(record(8, INDEX, struct.pack("<IHQ", 10, 1, 0)) * 100_000)
+    ),
+    "5 MB of entries that share their bytes": with_mcap(
+        lambda: indexed(record(8, INDEX, struct.pack("<IHQ", 4_000_000, 1, 0)) * 100_000)
+    ),
     "60 MB of small records": with_mcap(lambda: mcap_of(record(8) * (7 * MIB))),
     "no topic in CDR": with_sql("UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"),
     "stamps before 1970": with_sql("UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"),

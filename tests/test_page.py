@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
@@ -644,6 +645,17 @@ def test_equal_fmus_make_equal_pages(native_path, arm, tmp_path) -> None:
 def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:
     with pytest.raises(PageError, match="has no plant in C"):
         twodof.page(fmu_path, tmp_path / "x.html")
+    assert not (tmp_path / "x.html").exists()
+
+
+def test_an_fmu_of_large_sources_is_refused(native_path, tmp_path) -> None:
+    """Zeros of 129 MiB take 0.1 MB in an FMU."""
+    fmu = Path(shutil.copy(native_path, tmp_path / "large.fmu"))
+    with zipfile.ZipFile(fmu, "a", zipfile.ZIP_DEFLATED) as archive:
+        for k in range(129):
+            archive.writestr(f"sources/z{k}.h", bytes(2**20))
+    with pytest.raises(PageError, match="its C sources have more than 128 MiB together"):
+        twodof.page(fmu, tmp_path / "x.html")
     assert not (tmp_path / "x.html").exists()
 
 

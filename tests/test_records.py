@@ -193,6 +193,24 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
     assert "has metadata 'twodof' of 335" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["info", "plot"])
+def test_robots_of_a_bag_that_are_read_together_are_limited(bag, command, capsys):
+    (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) + FOOTER)
+    for i in range(33):
+        (bag / f"run.r{i:02}.json").write_text("{}")
+    assert main([command, str(bag)]) == 1
+    one = f"give one, such as '{bag}:r00'"
+    assert capsys.readouterr().err == f"twodof: error: the bag '{bag}' is of 33 robots, more than 32 at a time; {one}\n"
+
+
+def test_a_single_file_without_chunks_is_read_at_any_length(tmp_path, monkeypatch):
+    """As ``ros2 bag record --storage-preset-profile fastwrite`` writes it."""
+    monkeypatch.setattr(ReadBudget.__init__, "__defaults__", (10_000,))
+    file, stamps = tmp_path / "one.mcap", range(START, START + 300)
+    file.write_bytes(TOPIC + b"".join(message(joint_state(2, t), t * SECOND) for t in stamps) + FOOTER)
+    assert twodof.read_bag(file).t[-1] == 299.0
+
+
 def test_mcap_of_records_that_are_all_alike_is_not_read_to_its_end(bag):
     """Each of its chunks has a million empty messages in 3 kB."""
     million = message(b"") * 1_000_000

@@ -45,6 +45,7 @@ from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 import twodof
+from twodof.bag import recovery
 from twodof.cli.main import main
 from twodof.errors import BagError
 
@@ -380,6 +381,19 @@ def test_damaged_provenance_does_not_keep_the_messages(run, tmp_path):
     twodof.recover(bag)
     assert assert_consistent(bag, "mcap") > 0
     assert (bag / "run.json").read_text() == '{"format": 1, "fmu": {"na'
+
+
+def test_the_provenance_of_many_robots_is_not_held_without_a_limit(run, tmp_path, monkeypatch):
+    """The messages are saved, and what is left out is named."""
+    damaged = unfinished(tmp_path, run, "mcap", 3)
+    for name in ("a", "b", "c"):
+        (damaged / f"run.{name}.json").write_bytes(b" " * 1000)
+    (damaged / "run.json").unlink(missing_ok=True)
+    monkeypatch.setattr(recovery, "MAX_PROVENANCES", 2000)
+    found = twodof.recover(damaged)
+    assert "'run.c.json', with which" in found.damage and "run.b" not in found.damage
+    assert sorted(file.name for file in damaged.glob("*.json")) == ["run.a.json", "run.b.json"]
+    assert sum(found.counts.values()) > 0
 
 
 @pytest.mark.parametrize("place", ["nowhere", "file", "empty", "no bag", "both", "taken"])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -498,15 +500,17 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     yield from large_systems()
 
 
-def described(variables: str, structure: str = "", version: str = "2.0") -> bytes:
-    """Return an FMU that is only its description."""
+def described(
+    variables: str, structure: str = "", version: str = "2.0", files: Mapping[str, bytes] = MappingProxyType({})
+) -> bytes:
+    """Return an FMU of its description and other files."""
     identity = "guid" if version == "2.0" else "instantiationToken"
     xml = (
         f'<fmiModelDescription fmiVersion="{version}" modelName="m" {identity}="m">'
         f'<CoSimulation modelIdentifier="m"/><ModelVariables>{variables}</ModelVariables>'
         f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
     )
-    return zipped({"modelDescription.xml": xml.encode()})
+    return zipped({"modelDescription.xml": xml.encode(), **files})
 
 
 def large_systems() -> Iterator[tuple[str, bytes, dict[str, bytes], str]]:
@@ -536,6 +540,27 @@ def large_systems() -> Iterator[tuple[str, bytes, dict[str, bytes], str]]:
         inside = connection("x", "s.x")
     wiring = "more than 1000000 connections"
     yield "row", ssd(f"<ssd:Elements>{parts}</ssd:Elements>"), {"resources/u.fmu": described(scalars)}, wiring
+
+    numbers = random.Random(1)
+    scalars = "".join(
+        f'<ScalarVariable name="{name}" valueReference="{k}" causality="input" variability="continuous">'
+        '<Real start="0"/></ScalarVariable>'
+        for k, name in enumerate(format(numbers.getrandbits(180), "0180b") for _ in range(20_000))
+    )
+    wires = f"<ssd:Connections>{connection('u.' + '01' * 90, 'u.x')}</ssd:Connections>"
+    system = ssd(f"<ssd:Elements>{component('u')}</ssd:Elements>{wires}")
+    yield (
+        "names",
+        system,
+        {"resources/u.fmu": described(scalars)},
+        "there is no 'u.0101.* there are: .{3000,5000} in all$",
+    )
+
+    scalar = '<ScalarVariable name="u" valueReference="0" causality="input"><Real start="0"/></ScalarVariable>'
+    full = described(scalar, files={f"x{i}": b"" for i in range(9900)})
+    several = "".join(component(f"c{k}") for k in range(6))
+    many = {f"resources/c{k}.fmu": full for k in range(6)}
+    yield "files", ssd(f"<ssd:Elements>{several}</ssd:Elements>"), many, "FMUs have more than 50000 files together"
 
     few = range(1500)
     kinds = {"u": ("input", "start='0'"), "y": ("output", "")}

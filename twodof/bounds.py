@@ -1,6 +1,8 @@
 """Limits on untrusted files: sizes in bytes, processor times in s; those of URDFs are in ``plant/urdf.py``."""
 
 KIB, MIB = 1024, 1024**2
+MAX_COMPARED = 20_000_000  # product of the lengths of names that are compared with one another, in a second
+MAX_LISTED = 4000  # characters of the names that a message lists
 MAX_NUMBER = 1e300  # in a sweep: differences of larger numbers overflow
 
 # zip archives
@@ -19,10 +21,11 @@ MAX_COMPONENTS = 100  # FMUs and systems in a system, and connections in a row
 MAX_DESCRIPTIONS = 16 * MIB  # descriptions of all components of a system
 MAX_FMUS = 512 * MIB  # all FMUs of a system, which a check reads several times
 MAX_VARIABLES = 200_000  # variables of all components of a system
+MAX_FILES = 50_000  # files in all FMUs of a system
 MAX_WIRING = 1_000_000  # connections that the values of a system pass in all, and direct dependencies of its outputs
 MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB
-MAX_SOURCE = 16 * MIB  # a C file
+MAX_SOURCES = 128 * MIB  # C files that are compiled for a page; those of a Panda have 11 MiB
 MAX_CALL_WAIT = 60  # s of wall time, one call of an FMU under check
 MAX_CHECK_MEMORY = 4096 * MIB  # address space of an FMU under check; a Python FMU takes 0.5 GiB, more on many cores
 MAX_REFERENCES = 16 * MIB  # the references in an FMU, each file as often as it is read
@@ -63,17 +66,19 @@ MAX_TRAJECTORY = 4 * MIB  # a message; some ten thousand points, read within a s
 
 # bags
 MAX_TOPICS = 1000
+MAX_ROBOTS = 32  # that are read together, each of which reads the bag
 MAX_CHUNK = 256 * MIB  # a chunk or message; writers cut chunks at 1 to 4 MiB
 MAX_RATIO = 1000  # unpacked to packed size; an arm at rest reaches 24, a robot of 50 joints 220
 MAX_HOLLOW = 100  # size of a file to its size on the disk; file systems that compress reach 30
 MAX_SUMMARY = 64 * MIB
 MAX_METADATA = 64 * MIB
 MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much memory
+MAX_PROVENANCES = 64 * MIB  # of all robots of a bag, which a recovery holds
 MAX_HELD = 5_000_000  # input values, summed over all changes of inputs
 MAX_JOINT_STATE = 64 * KIB  # a message; a thousand joints
 MAX_SAMPLES = 2048 * MIB  # joint states in memory; a day of 7 joints at 100 Hz takes 1450 MiB
 MAX_SAMPLES_RATIO = 50  # joint states in memory beyond MAX_DRAWN to the bag's size; an arm at rest reaches 12
-MAX_DRAWN = 256 * MIB  # joint states in memory from which samples to draw are chosen
+MAX_DRAWN = 128 * MIB  # joint states in memory from which samples to draw are chosen
 MAX_LOOSE = 16 * MIB  # records outside chunks that are read at a time, apart from one large record
 MAX_VALUE = 1e100  # of a sample that is judged, fitted or drawn: squares of much larger numbers overflow
 MAX_PROFILES = 64 * KIB  # different QoS profiles of all topics, in YAML, which is slow to parse

@@ -15,6 +15,8 @@ from itertools import islice
 from os import PathLike, scandir
 from pathlib import Path
 
+from .bounds import MAX_COMPARED, MAX_LISTED
+
 MOST_NEIGHBOURS = 1000  # files of a folder among which the nearest name is searched
 KINDS = {
     "bag": ("a bag", "twodof view"),
@@ -105,8 +107,11 @@ def step_failure(k: int, t: float, error: SimulationError, remark: str = "") -> 
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return the most similar known name, ignoring case; None without a similar one."""
-    by_lower = {candidate.lower(): candidate for candidate in reversed([*known])}
+    """Return the most similar known name, ignoring case; None without a similar one, or with too many to compare."""
+    known = [*known]
+    if len(name) * sum(map(len, known)) > MAX_COMPARED:
+        return None
+    by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
     near = get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
     return by_lower[near[0]] if near else None
 
@@ -115,7 +120,12 @@ def choice(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """Return the end of a message about an unknown name: the nearest known one, or all."""
     names = [*known]
     near = nearest(name, names, cutoff)
-    return f"; there are: {', '.join(names)}" if near is None else f"; did you mean '{near}'?"
+    if near is not None:
+        return f"; did you mean '{near}'?"
+    listed = ", ".join(names)
+    if len(listed) > MAX_LISTED:
+        listed = f"{listed[:MAX_LISTED].rpartition(', ')[0]}, …, {len(names)} in all"
+    return f"; there are: {listed}"
 
 
 def kind_of(path: Path) -> str:

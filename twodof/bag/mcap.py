@@ -44,7 +44,6 @@ def _chunks(path: Path, budget: ReadBudget) -> Iterator[bytes]:
     size = 0
     try:
         for opcode, content in _records(path, budget):
-            budget.left += MAX_RATIO * len(content)
             if opcode != CHUNK:
                 loose.append(content)
                 size += len(content)
@@ -177,6 +176,7 @@ def _records(path: Path, budget: ReadBudget, wanted: Sequence[int] = READ) -> It
             if len(head) < HEAD.size:
                 raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
             opcode, length = HEAD.unpack(head)
+            budget.left += MAX_RATIO * length
             budget.spend(RECORD)
             position += HEAD.size + length
             if opcode == 0 or position > size:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
-from ..bounds import MAX_HELD, MAX_PROVENANCE
+from ..bounds import MAX_HELD, MAX_PROVENANCE, MAX_ROBOTS
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..fmu import System
@@ -208,8 +208,15 @@ def robot_in(path: Path) -> tuple[Path, str]:
 
 
 def each_robot(path: Path) -> list[Path]:
-    """Return the addresses of a bag's robots, as ``robot_in`` accepts them."""
+    """Return the addresses of a bag's robots, as ``robot_in`` accepts them.
+
+    Raises:
+        BagError: the bag has more than MAX_ROBOTS robots.
+    """
     robots = robots_of(path) if path.is_dir() else [""]
+    if len(robots) > MAX_ROBOTS:
+        one = f"give one, such as '{path}:{robots[0]}'"
+        raise BagError(f"the bag '{path}' is of {len(robots)} robots, more than {MAX_ROBOTS} at a time; {one}")
     return [path] if len(robots) == 1 else [Path(f"{path}:{robot}") for robot in robots]
 
 

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader, ReaderError, WriterError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from ..bounds import MAX_DEFINITION, MAX_DEFINITIONS, MAX_MESHES, MAX_PROFILES, MAX_PROVENANCE
+from ..bounds import MAX_DEFINITION, MAX_DEFINITIONS, MAX_MESHES, MAX_PROFILES, MAX_PROVENANCE, MAX_PROVENANCES, MIB
 from ..errors import BagError, no_such
 from ..files import lock, read_file, sync
 from . import provenance
@@ -145,7 +145,11 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
     for robot in robots:
         name = provenance.file_of(robot)
         with suppress(OSError):
-            kept[name] = read_file(folder / name, MAX_PROVENANCE, follow=False)
+            content = read_file(folder / name, MAX_PROVENANCE, follow=False)
+            if sum(map(len, kept.values())) + len(content) > MAX_PROVENANCES:
+                damage.append(f"'{name}', with which all of its kind have more than {MAX_PROVENANCES // MIB} MiB")
+                continue
+            kept[name] = content
         with suppress(BagError):  # save the messages without a damaged provenance
             if known := provenance.read_provenance(folder, robot):
                 text = provenance.for_metadata(kept[name], known)

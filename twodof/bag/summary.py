@@ -112,12 +112,15 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
             tables.add(path, opcode, content, position)
         elif opcode == CHUNK_INDEX:
             first, last, offset, size, more = CHUNK_FIELDS.unpack_from(content, position)
-            offsets = content[position + CHUNK_FIELDS.size :][:more]
+            begin = position + CHUNK_FIELDS.size
+            if CHUNK_FIELDS.size + more > length:  # else many records could share the same bytes
+                return None
+            offsets = content[begin : begin + more]
             channels = frozenset(number for number, _ in struct.iter_unpack("<HQ", offsets))
             chunks.append(Chunk(first, last, offset, size, channels))
         elif opcode == STATISTICS:
             stated, *_, chunk_count, _, _, size = STATISTICS_FIELDS.unpack_from(content, position)
-            pairs = content[position + STATISTICS_FIELDS.size :][:size]
+            pairs = content[position + STATISTICS_FIELDS.size : position + STATISTICS_FIELDS.size + size]
             counts = dict(struct.iter_unpack("<HQ", pairs))
         position += length
     whole = counts is not None and sum(counts.values()) == stated and len(chunks) == chunk_count

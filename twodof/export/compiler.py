@@ -204,8 +204,10 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str, 
             environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache or folder / "zig-cache")
             environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # for these sources only
             if cache:
-                made_of = repr((version("ziglang"), *command, output, sorted(sources.items())))
-                kept = cache / "twodof" / hashlib.sha256(made_of.encode()).hexdigest()
+                made_of = hashlib.sha256(repr((version("ziglang"), *command, output)).encode())
+                for file, content in sorted(sources.items()):
+                    made_of.update(repr((file, len(content))).encode() + content)
+                kept = cache / "twodof" / made_of.hexdigest()
                 content = _kept(kept)
                 if content is not None:
                     return content

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..bounds import MAX_DESCRIPTIONS, MAX_VARIABLES
+from ..bounds import MAX_DESCRIPTIONS, MAX_FILES, MAX_VARIABLES
 from ..errors import FmuError, choice
 from ..export.package import has_member
 from .description import Fmu, Scalar, load_any_fmu, logged
@@ -122,10 +122,13 @@ def load_system(path: Path, robot: str = "") -> System:
     title, top, times, structure = read_ssp(path)
     fmus: dict[str, Fmu] = {}
     by_source: dict[str, Fmu] = {}
-    room, free = MAX_DESCRIPTIONS, MAX_VARIABLES
+    room, free, files = MAX_DESCRIPTIONS, MAX_VARIABLES, MAX_FILES
     for element in (each for each in top.walk() if each.source):
         if element.source not in by_source:
             by_source[element.source] = load_any_fmu(path, element.source)
+            files -= len(by_source[element.source].members)
+            if files < 0:
+                raise FmuError(f"'{path}': its FMUs have more than {MAX_FILES} files together")
         fmus[element.name] = fmu = by_source[element.source]
         room, free = room - fmu.described, free - len(fmu.variables)
         if room < 0 or free < 0:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..bag.provenance import provenance_of
 from ..bag.storage import profile
-from ..bounds import MAX_HEAD, MAX_SOURCE
+from ..bounds import MAX_HEAD, MAX_SOURCES, MIB
 from ..errors import BuildError, PageError
 from ..export.compiler import compile_web_module, compiles_for_the_web, standard_headers
 from ..files import data_file, head_of, read_member, refusing, write_file
@@ -166,12 +166,13 @@ def arm_of(run: Experiment) -> Arm:
 
 def _sources(fmu: Fmu) -> dict[str, bytes]:
     """Return the C files of sources/ and their headers, by file name."""
+    names = [
+        name for name in fmu.members if name.count("/") == 1 and name[:8] == "sources/" and name[-2:] in (".c", ".h")
+    ]
     with opened(fmu) as archive:
-        return {
-            Path(name).name: read_member(archive, name, MAX_SOURCE)
-            for name in fmu.members
-            if name.count("/") == 1 and name[:8] == "sources/" and name[-2:] in (".c", ".h")
-        }
+        if sum(archive.getinfo(name).file_size for name in names) > MAX_SOURCES:
+            raise PageError(f"'{fmu.path}': its C sources have more than {MAX_SOURCES // MIB} MiB together")
+        return {Path(name).name: read_member(archive, name, MAX_SOURCES) for name in names}
 
 
 def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: object) -> bytes:
