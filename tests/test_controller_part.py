@@ -236,6 +236,19 @@ def test_a_payload_that_only_the_controller_has_is_named(ssp: Path) -> None:
     assert cured.outcome == "reached" and not cured.causes
 
 
+def test_a_split_robot_measures_what_its_controller_sees(ssp: Path, tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"controller.q_noise": 0.01, "controller.q_resolution": 0.02}
+    samples = list(twodof.samples(ssp, stop_time=0.2, settings=settings, signals=True))
+    names = twodof.experiment(ssp, signals=True).signals
+    seen = np.array([sample.q_meas for sample in samples])
+    q = np.array([sample.q for sample in samples])
+    assert 0.002 < np.abs(seen - q).max() < 0.06
+    plain = names.index("plant.q_meas[1]")
+    assert [sample.signals[plain] for sample in samples] == q[:, 0].tolist()
+    twodof.run(ssp, twodof.Bag(tmp_path / "bag", measured=True), stop_time=0.2, settings=settings)
+    assert (twodof.read_bag(tmp_path / "bag").q == seen).all()
+
+
 def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None:
     """Each start value goes to its FMU; names are those of the FMU of both."""
     system = twodof.load_fmu(ssp)

@@ -214,6 +214,22 @@ def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path):
     assert any(label in a["text"] for a in over["layout"]["annotations"])
 
 
+def test_measured_velocities_mark_no_stretches_in_which_friction_holds_a_joint(tmp_path):
+    """A coarse encoder shows a velocity of 0 while the joint moves."""
+    fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
+    seen = {"control_period": 0.01, "q_resolution": 0.05, "v_from_q": True}
+    settings = {"friction": (3.0, 0.0), "q_des": (1.4, -0.5), "gravity": (0.0, 0.0, 0.0), **seen}
+    bag = twodof.Bag(tmp_path / "bag", measured=True)
+    twodof.simulate(fmu, bag, stop_time=1.5, settings=settings)
+    recording = twodof.read_bag(bag.path)
+    assert (recording.v[:, 0] == 0.0).mean() > 0.5 and recording.measured
+    assert not lines(panels(plot(bag.path)).q[0], "grey band: held by friction")
+    provenance = recording.provenance.copy()
+    del provenance["verdict"]
+    again = replace(recording, provenance=provenance).verdict
+    assert "friction" not in [cause.kind for cause in again.causes]
+
+
 def test_targets_of_many_joints_are_legible(tmp_path):
     """They are next to limits with long names and efforts; the legend has one entry for them."""
     fmu = build(tmp_path, chain_urdf("zyx" * 4, 0.1, low=-1.234, high=2.345), control="joint")

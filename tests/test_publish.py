@@ -80,6 +80,25 @@ def test_fast_dds_receives_every_field_of_the_bag(native_path, tmp_path, number,
     assert 0 < min(delays) < 0.02 * SECOND  # of those that a busy machine did not hold up
 
 
+def test_the_network_has_what_the_sensors_measure(tmp_path, number, listen):
+    """The true states are on a topic of their own, in the bag as well."""
+    options = twodof.FmuOptions(control="effort", native=True)
+    fmu, bag = twodof.build_fmu(tmp_path / "bare.fmu", options), tmp_path / "bag"
+    settings = {"gravity": "0", "q_start": "0.5,0.25", "q_noise": "0.1", "v_noise": "1"}
+    given = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
+    node = listen("/joint_states", "/joint_states_true")
+    with published(number, fmu, *given, "--stop-time", "4", "-o", str(bag)) as process:
+        ended(process)
+    truth = recorded(bag)
+    for topic in ("/joint_states", "/joint_states_true"):
+        node.sees(truth[topic][-1], topic)
+        heard = node.messages(topic)
+        assert heard == truth[topic][-len(heard) :]
+    assert {(*state[2], *state[3]) for state in truth["/joint_states_true"]} == {(0.5, 0.25, 0.0, 0.0)}
+    noise = np.array([state[2] for state in truth["/joint_states"]]) - [0.5, 0.25]
+    assert 0.08 < noise.std() < 0.12 and np.std([state[3] for state in truth["/joint_states"]]) > 0.8
+
+
 def test_a_late_subscriber_receives_latched_messages_and_the_last_sample_before_a_signal(
     native_path, tmp_path, number, listen, length
 ):

@@ -312,7 +312,7 @@ int main(int count, char** arguments) {
             writers[name] = talk(name, TypeSupport(new std_msgs::msg::dds_::UInt32_PubSubType));
         else if (type == "clock")
             listen<Clock_>(name, TypeSupport(new rosgraph_msgs::msg::dds_::Clock_PubSubType));
-        else if (type == "state" || name == "/joint_states")
+        else if (type == "state" || name.rfind("/joint_states", 0) == 0)
             listen<JointState_>(name, state);
         else if (name == "/robot_description")
             listen<String_>(name, TypeSupport(new std_msgs::msg::dds_::String_PubSubType), true);

@@ -19,6 +19,7 @@ from ..errors import BagError
 from ..files import fits, shown
 from ..notebook import card, picture
 from ..plant.urdf import Urdf
+from ..ros.messages import TRUE_STATES
 from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE
 from ..simulation.input_values import Value
 from ..simulation.setup import Setup, robot_of
@@ -112,6 +113,11 @@ class Recording:
         """Task axes, letters of "xyz"; "" if unknown."""
         return str(self.provenance.get("axes") or "")
 
+    @property
+    def measured(self) -> bool:
+        """Whether q and v are measured values; then /joint_states_true has the true ones."""
+        return any(topic.name.endswith(TRUE_STATES) for topic in self.topics)
+
     @cached_property
     def schedule(self) -> Schedule:
         """Values of inputs and parameters, with the communication point from which on they apply."""
@@ -181,6 +187,8 @@ class Recording:
 
     def _setup(self, robot: Urdf | None, frame: str, axes: str) -> Setup:
         starts = {} if KNOWN_UNTIL in self.provenance else self.schedule[0][1]
+        if self.measured:  # a measured velocity of 0 does not show that friction holds the joint
+            starts = {name: value for name, value in starts.items() if not name.startswith("friction[")}
         step = self.provenance.get("step") or self.t[-1] / max(1, len(self.t) - 1)
         return setup_of(joints=self.joints, robot=robot, frame=frame, axes=axes, step=step, starts=starts)
 

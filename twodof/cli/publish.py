@@ -56,6 +56,7 @@ def add(publish: Parser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
+    from ..ros.messages import has_sensors
     from ..ros.network import network_of_environment
     from ..ros.realtime import PublisherOptions, publish_together
     from ..simulation.pace import RealTime
@@ -67,7 +68,8 @@ def call(options: argparse.Namespace) -> int:
     check_company(options, needs={**dict.fromkeys(of_a_bag, "-o"), **of_foxglove})
     options.storage = options.storage or "mcap"
     robots = _robots(options)
-    bag = bag_of(options, options.output) if options.output else None
+    measured = any(map(has_sensors, robots.values())) and all(run.fmu.vector("q_meas") for run in robots.values())
+    bag = bag_of(options, options.output, measured=measured) if options.output else None
     bags = {}
     if bag is not None:  # each robot has a part of the bag, in its namespace
         space = options.namespace

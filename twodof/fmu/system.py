@@ -139,7 +139,7 @@ def load_system(path: Path, robot: str = "") -> System:
     batches = order(path, fmus, links)
     chosen = _robot(path, fmus, robot)
     starts = _bound(path, wiring)
-    variables, places = _variables(path, wiring, fmus, links, starts, chosen)
+    variables, places = _variables(path, wiring, fmus, links, starts, chosen, _measuring(fmus, links, chosen))
     digest = hashlib.sha256(structure)
     for fmu in by_source.values():
         digest.update(fmu.guid.encode() + b"\0")
@@ -177,6 +177,14 @@ def _robot(path: Path, fmus: dict[str, Fmu], robot: str) -> str:
     return robots[0]
 
 
+def _measuring(fmus: Mapping[str, Fmu], links: list[Link], robot: str) -> str:
+    """Return the component that measures the robot: a controller with outputs q_meas that reads q, or the robot."""
+    q = Node(robot, fmus[robot].vector("q")[0])
+    readers = {link.target.element for link in links if link.source == q}
+    having = [name for name in readers if name in fmus and fmus[name].vector("q_meas")]
+    return having[0] if len(having) == 1 else robot
+
+
 def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
     """Return start values from parameter bindings; outer systems take precedence over inner ones."""
     starts: dict[Node, float | bool] = {}
@@ -212,8 +220,12 @@ def _variables(
     links: list[Link],
     starts: Mapping[Node, float | bool],
     robot: str,
+    measuring: str,
 ) -> tuple[dict[str, Scalar], dict[str, Node]]:
-    """Return the variables of a system, and the component's variable or the connector for each of them."""
+    """Return the variables of a system, and the component's variable or the connector for each of them.
+
+    Names without a component are those of the robot, except for measured values.
+    """
     variables: dict[str, Scalar] = {}
     places: dict[str, Node] = {}
 
@@ -243,7 +255,8 @@ def _variables(
             node = Node(element, scalar.name)
             if scalar.causality in ("input", "output", "parameter"):
                 alone = scalar.causality == "input" and node not in ends and names[scalar.name] == 1
-                own = (element == robot or alone) and scalar.name not in variables
+                of = measuring if scalar.name.partition("[")[0] in ("q_meas", "v_meas") else robot
+                own = (element == of or alone) and scalar.name not in variables
                 start = starts.get(node, scalar.start_value)
                 causality = "local" if node in ends else scalar.causality
                 add(scalar.name if own else str(node), node, scalar, causality, start)

@@ -34,7 +34,7 @@ class JointTrack:
         effort: limit of the URDF, N·m or N; None if unknown.
         q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample, N
             values each; unknown ones are empty.
-        has_friction: whether it has friction.
+        has_friction: whether it has friction, and the velocities are true ones, which are 0 while friction holds it.
     """
 
     name: str
@@ -231,7 +231,7 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
         )
         if effort is not None and first.get("limit_effort"):  # commands may exceed it; a bag's efforts do not
             tau = np.clip(tau, -effort, effort)
-        has_friction = bool(first.get(f"friction[{i + 1}]"))
+        has_friction = bool(first.get(f"friction[{i + 1}]")) and not bag.measured
         joints.append(JointTrack(name, unit, low, high, effort, q, v, tau, target, has_friction))
     return tuple(joints)
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ..errors import BagError, InputError
-from ..fmu import read_resource
+from ..fmu import resource_reader
 from ..plant.urdf import Joint, RobotError
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Value
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 JOINT_STATES = "/joint_states"
 TRUE_STATES = "/joint_states_true"
+SENSORS = ("q_resolution", "q_noise", "v_noise", "v_from_q")
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TRANSFORMS = "/tf"
 TARGET = "/target"
@@ -124,6 +125,12 @@ SCENE_TOPICS = {
     TARGET: Topic(POINT, STREAM),
     END_EFFECTOR: Topic(POINT, STREAM),
 }
+
+
+def has_sensors(run: Experiment) -> bool:
+    """Return whether a run measures joint states that differ from the true ones."""
+    settings = ((name.rpartition(".")[2].partition("[")[0], value) for name, value in run.start_values.items())
+    return bool(run.fmu.vector("q_meas")) and any(name in SENSORS and value for name, value in settings)
 
 
 class Messages:
@@ -267,7 +274,7 @@ def _load_scene(run: Experiment, meshes_in: str) -> Scene:
     from .scene import Scene  # SciPy takes half a second to import
 
     try:
-        return Scene(urdf, run.fmu.joints, run.fmu.frame, lambda name: read_resource(run.fmu, name), meshes_in)
+        return Scene(urdf, run.fmu.joints, run.fmu.frame, resource_reader(run.fmu), meshes_in)
     except RobotError as error:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
 

@@ -18,7 +18,7 @@ from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic
 from .listener import ORDERS, Listener
-from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name
+from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name, has_sensors
 from .network import Network, OpenDomain, network_of_environment, open_domain
 
 # isort: split
@@ -31,6 +31,8 @@ LOCKSTEP_TIMEOUT = 10.0  # s
 
 class Publisher(Sink):
     """A sink that publishes each sample, and receives targets and commands.
+
+    If the robot has sensors, /joint_states has the measured values, and /joint_states_true the true ones.
 
     Args:
         network: the network settings, or an open domain; None: from the environment variables.
@@ -100,7 +102,8 @@ class Publisher(Sink):
         """
         self._run, self._follows = run, Commands(run.fmu)
         run.commanders.clear()  # from an earlier run
-        self._messages = Messages(run, scene=self._scene, effort=self._effort, clock=self._clock)
+        of_what = {"scene": self._scene, "effort": self._effort, "clock": self._clock, "measured": has_sensors(run)}
+        self._messages = Messages(run, **of_what)
         self.topics = tuple(map(self._named, self._messages.topics))
         of_joints = self._follows.type == JOINT_STATE
         self._watchdog: Watchdog | None = None
