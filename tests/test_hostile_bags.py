@@ -4,8 +4,10 @@ MCAP files are made record by record by the specification. test_records.py tests
 """
 
 import shutil
+import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from zlib import crc32
 
@@ -127,6 +129,57 @@ def indexed(index: bytes) -> bytes:
     return body + summary + foot + struct.pack("<I", crc32(foot, crc32(summary))) + b"\x89MCAP0\r\n"
 
 
+def forged_log(bag: Path) -> None:
+    """A write-ahead log of 33 kB that states 3 million pages, and four texts of a gigabyte in a chain of one page."""
+    size, page, texts = 990_000_000, 4096, 4
+    next(bag.glob("*.mcap")).unlink()
+    file = bag / "bag.db3"
+    with closing(sqlite3.connect(file)) as database:
+        for pragma in ("page_size = 4096", "journal_mode = WAL", "wal_autocheckpoint = 0"):
+            database.execute(f"PRAGMA {pragma}")
+        for table in ("topics(id INTEGER PRIMARY KEY, name, type, serialization_format, offered_qos_profiles)", "z(a)"):
+            database.execute(f"CREATE TABLE {table}")
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+        database.execute("INSERT INTO topics VALUES (1, 'a', 'b', 'c', 'd')")
+        database.execute("INSERT INTO z VALUES (1)")
+        database.commit()
+        roots = dict(database.execute("SELECT name, rootpage FROM sqlite_master"))
+        log = bytearray(Path(f"{file}-wal").read_bytes())
+        plain = file.read_bytes()
+    head = b"".join(map(varint, [0, *[13 + 2 * size] * texts]))
+    head = varint(len(head) + 1) + head
+    payload, least = len(head) + size * texts, (page - 12) * 32 // 255 - 23
+    local = least + (payload - least) % (page - 4)
+    local = local if local <= page - 35 else least
+    chain = struct.pack(">I", roots["z"])
+    cell = varint(payload) + varint(1) + head + b"a" * (local - len(head)) + chain
+    leaf = struct.pack(">BHHHBH", 13, 0, 1, page - len(cell), 0, page - len(cell))
+    sums = struct.unpack_from(">II", log, 24)
+    for start in range(32, len(log), page + 24):
+        number, commit = struct.unpack_from(">II", log, start)
+        if number == roots["topics"]:
+            log[start + 24 : start + 24 + page] = leaf.ljust(page - len(cell), b"\0") + cell
+        elif number == roots["z"]:
+            log[start + 24 : start + 24 + page] = chain.ljust(page, b"a")
+        elif number == 1:
+            struct.pack_into(">I", log, start + 24 + 28, 3_000_000)
+        if commit:
+            struct.pack_into(">I", log, start + 4, 3_000_000)
+        for part in (log[start : start + 8], log[start + 24 : start + 24 + page]):
+            for pair in struct.iter_unpack("<II" if log[3] == 0x82 else ">II", part):
+                first = (sums[0] + pair[0] + sums[1]) % 2**32
+                sums = first, (sums[1] + pair[1] + first) % 2**32
+        struct.pack_into(">II", log, start + 16, *sums)
+    file.write_bytes(plain)
+    Path(f"{file}-wal").write_bytes(log)
+
+
+def varint(number: int) -> bytes:
+    """An integer of SQLite, with seven bits in each byte."""
+    parts = [number >> shift & 127 for shift in range(0, max(7, number.bit_length()), 7)]
+    return bytes([*(part | 128 for part in parts[:0:-1]), parts[0]])
+
+
 def lz4_zeros(size: int) -> bytes:
     packer = lz4.frame.LZ4FrameCompressor()
     parts = [packer.begin(), *(packer.compress(bytes(MIB)) for _ in range(size // MIB))]
@@ -196,6 +249,7 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     "5 MB of entries that share their bytes": with_mcap(
         lambda: indexed(record(8, INDEX, struct.pack("<IHQ", 4_000_000, 1, 0)) * 100_000)
     ),
+    "texts of a gigabyte in a log": forged_log,
     "60 MB of small records": with_mcap(lambda: mcap_of(record(8) * (7 * MIB))),
     "no topic in CDR": with_sql("UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"),
     "stamps before 1970": with_sql("UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"),

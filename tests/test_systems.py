@@ -559,8 +559,8 @@ def large_systems() -> Iterator[tuple[str, bytes, dict[str, bytes], str]]:
     scalar = '<ScalarVariable name="u" valueReference="0" causality="input"><Real start="0"/></ScalarVariable>'
     full = described(scalar, files={f"x{i}": b"" for i in range(9900)})
     several = "".join(component(f"c{k}") for k in range(6))
-    many = {f"resources/c{k}.fmu": full for k in range(6)}
-    yield "files", ssd(f"<ssd:Elements>{several}</ssd:Elements>"), many, "FMUs have more than 50000 files together"
+    fmus = {f"resources/c{k}.fmu": full for k in range(6)}
+    yield "files", ssd(f"<ssd:Elements>{several}</ssd:Elements>"), fmus, "FMUs have more than 50000 files together"
 
     few = range(1500)
     kinds = {"u": ("input", "start='0'"), "y": ("output", "")}

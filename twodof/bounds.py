@@ -1,8 +1,6 @@
 """Limits on untrusted files: sizes in bytes, processor times in s; those of URDFs are in ``plant/urdf.py``."""
 
 KIB, MIB = 1024, 1024**2
-MAX_COMPARED = 20_000_000  # product of the lengths of names that are compared with one another, in a second
-MAX_LISTED = 4000  # characters of the names that a message lists
 MAX_NUMBER = 1e300  # in a sweep: differences of larger numbers overflow
 
 # zip archives

@@ -15,8 +15,8 @@ from itertools import islice
 from os import PathLike, scandir
 from pathlib import Path
 
-from .bounds import MAX_COMPARED, MAX_LISTED
-
+MAX_COMPARED = 20_000_000  # product of the lengths of names that are compared with one another, in a second
+MAX_LISTED = 4000  # characters of the names in a message
 MOST_NEIGHBOURS = 1000  # files of a folder among which the nearest name is searched
 KINDS = {
     "bag": ("a bag", "twodof view"),

@@ -140,19 +140,12 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
     robots = provenance.robots_of(folder)
     others = set()
     writer = BagWriter(new, storage)
-    kept: dict[str, bytes] = {}
+    kept = _provenances(folder, robots, damage)
     room = 4 * provenance.MAX_YAML
-    for robot in robots:
-        name = provenance.file_of(robot)
-        with suppress(OSError):
-            content = read_file(folder / name, MAX_PROVENANCE, follow=False)
-            if sum(map(len, kept.values())) + len(content) > MAX_PROVENANCES:
-                damage.append(f"'{name}', with which all of its kind have more than {MAX_PROVENANCES // MIB} MiB")
-                continue
-            kept[name] = content
+    for robot in (robot for robot in robots if provenance.file_of(robot) in kept):
         with suppress(BagError):  # save the messages without a damaged provenance
             if known := provenance.read_provenance(folder, robot):
-                text = provenance.for_metadata(kept[name], known)
+                text = provenance.for_metadata(kept[provenance.file_of(robot)], known)
                 room -= len(text)
                 if room >= 0:
                     writer.set_custom_data(provenance.key_of(robot), text)
@@ -195,6 +188,19 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     sync(*new.iterdir(), new)
     return counts, "; ".join(damage)
+
+
+def _provenances(folder: Path, robots: Iterable[str], damage: list[str]) -> dict[str, bytes]:
+    """Return the provenance files of robots by name; add those for which there is no room to the damage."""
+    kept: dict[str, bytes] = {}
+    for name in map(provenance.file_of, robots):
+        with suppress(OSError):
+            content = read_file(folder / name, MAX_PROVENANCE, follow=False)
+            if sum(map(len, kept.values())) + len(content) > MAX_PROVENANCES:
+                damage.append(f"'{name}', with which all of its kind have more than {MAX_PROVENANCES // MIB} MiB")
+            else:
+                kept[name] = content
+    return kept
 
 
 class _Topics:

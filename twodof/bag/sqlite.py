@@ -3,6 +3,7 @@
 import os
 import shutil
 import sqlite3
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from itertools import groupby, islice
@@ -23,6 +24,7 @@ TABLES = {  # ROS 2's tables and their columns; older versions lack the last one
     "messages": "id topic_id timestamp data",
 }
 SCHEMA_STEPS = 1000  # instructions of SQLite's virtual machine
+MOST_LOST = 16  # size that a database states to that of its files, which a crash may have shortened
 SOME, SOME_BYTES = 1000, 16 * MIB  # rows in a group, and their size from which it ends
 
 
@@ -120,6 +122,12 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
         raise DamageError(f"'{path.name}' has {table} that are not those of ROS 2")
     names = ", ".join(name if name in known else "NULL" for name in columns)
     room = sum(file.stat().st_size for file in (path, *_unfinished(path)))
+    if sys.version_info >= (3, 11):  # SQLite would read a value of a gigabyte from pages in a circle
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(room, MIB))
+    else:
+        (pages,), (size,) = (database.execute(f"PRAGMA page_{what}").fetchone() for what in ("count", "size"))
+        if pages * size > max(SOME_BYTES, MOST_LOST * room):
+            raise DamageError(f"'{path.name}' is damaged")
     for row in database.execute(f"SELECT {names} FROM {table} NOT INDEXED") if stored else ():
         room -= len(known) + sum(map(length_hint, row))
         if room < 0:

@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from ..errors import BagError, path_of
 from ..files import sync
-from ..fmu import read_resource
+from ..fmu import resource_reader
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, Messages, check_name
 from ..simulation.experiments import Experiment
@@ -146,10 +146,11 @@ class Bag(Sink):
         self._provenance = ProvenanceFile(self.path, self.namespace, run, self._command_line)
         if self._store.fsync:
             sync(self._provenance.path)
+        read = resource_reader(run.fmu)
         for name in [name for name in run.fmu.members if self._meshes and name.startswith("resources/meshes/")]:
             file = self._folder / name.removeprefix("resources/")
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(read_resource(run.fmu, name.removeprefix("resources/")) or b"")
+            file.write_bytes(read(name.removeprefix("resources/")) or b"")
         topics = {self._named(name): topic for name, topic in self._messages.topics.items()}
         self._connections = dict(zip(self._messages.topics, self._store.add_topics(topics)))
 

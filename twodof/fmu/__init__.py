@@ -6,7 +6,7 @@ with redirect_stdout(None):  # FMPy prints on aarch64-linux that it has no logge
     import fmpy  # noqa: F401
 
 from ..export.start_values import Setting, no_variable, resolve
-from .description import Fmu, load_any_fmu, opened, read_resource
+from .description import Fmu, load_any_fmu, opened, resource_reader
 from .instance import Instance, Values
 from .system import System, load_fmu
 from .system_instance import SystemInstance, instantiate
@@ -23,6 +23,6 @@ __all__ = [
     "load_fmu",
     "no_variable",
     "opened",
-    "read_resource",
     "resolve",
+    "resource_reader",
 ]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import prod
@@ -130,7 +130,7 @@ class Fmu:
     @property
     def urdf(self) -> str | None:
         """Text of resources/robot.urdf; None without it."""
-        content = read_resource(self, "robot.urdf")
+        content = resource_reader(self)("robot.urdf")
         try:
             return None if content is None else content.decode("utf-8")
         except UnicodeDecodeError as error:
@@ -277,11 +277,25 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
         raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
 
 
-def read_resource(fmu: Fmu, name: str) -> bytes | None:
-    """Return a file of the FMU's resources/ folder; None without it."""
-    with opened(fmu) as archive, suppress(KeyError):
-        return read_member(archive, f"resources/{name}", MAX_RESOURCE)
-    return None
+def resource_reader(fmu: Fmu) -> Callable[[str], bytes | None]:
+    """Return a function that returns files of the FMU's resources/ folder, None without one; it keeps the FMU open.
+
+    Raises:
+        FmuError: as ``opened``, at the first file.
+    """
+    archives, kept = list[zipfile.ZipFile](), ExitStack()
+
+    def read(name: str) -> bytes | None:
+        if (member := f"resources/{name}") not in fmu.members:
+            return None
+        try:
+            if not archives:
+                archives.append(kept.enter_context(opened(fmu)))
+            return read_member(archives[0], member, MAX_RESOURCE)
+        except ZIP_ERRORS as error:
+            raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
+
+    return read
 
 
 def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:

@@ -11,7 +11,6 @@ import hashlib
 import html
 import json
 from collections.abc import Mapping, Sequence
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ from ..bounds import MAX_HEAD, MAX_SOURCES, MIB
 from ..errors import BuildError, PageError
 from ..export.compiler import compile_web_module, compiles_for_the_web, standard_headers
 from ..files import data_file, head_of, read_member, refusing, write_file
-from ..fmu import Fmu, opened, read_resource
+from ..fmu import Fmu, opened, resource_reader
 from ..geometry.kinematics import Kinematics, Placement
 from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
@@ -142,7 +141,7 @@ def arm_of(run: Experiment) -> Arm:
     urdf = fmu.urdf or ""
     try:
         robot = read_urdf(urdf)
-        shapes, _ = link_shapes(robot, partial(read_resource, fmu))
+        shapes, _ = link_shapes(robot, resource_reader(fmu))
         if fmu.frame and fmu.frame not in robot.links:
             raise RobotError(f"it has no link '{fmu.frame}'")
     except RobotError as error:

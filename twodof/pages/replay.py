@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -15,7 +14,7 @@ from ..errors import BuildError, FmuError, PageError
 from ..export.mesh_files import collect_meshes
 from ..export.urdf_source import read_text
 from ..files import data_file, refusing, write_file
-from ..fmu import load_fmu, read_resource
+from ..fmu import load_fmu, resource_reader
 from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
 from ..geometry.shapes import Shape, link_shapes
@@ -146,7 +145,7 @@ def _robot(
         return renamed, files.get
     text = bag.provenance["urdf"] or ""
     if fmu is not None:
-        return text, partial(read_resource, load_fmu(fmu))
+        return text, resource_reader(load_fmu(fmu))
     maker = bag.provenance["fmu"]
     for folder in (Path(), bag.path.resolve().parent):
         try:
@@ -154,7 +153,7 @@ def _robot(
         except FmuError:
             continue
         if candidate.guid == maker["guid"]:
-            return text, partial(read_resource, candidate)
+            return text, resource_reader(candidate)
     shipped = data_file("urdf", "2dof.urdf")
     meshes = data_file("meshes")
     renamed, files = collect_meshes(shipped.read_text("utf-8"), shipped.parent, meshes)
