@@ -191,6 +191,12 @@ FAILURES = {
         ("unstable",),
         "Kp_rot = 50 s⁻² and Kd_rot = 40 s⁻¹ are too high for control_period = 0.05 s: the loop is at its limit",
     ),
+    "an unknown load, and friction that is too small to matter": Failure(
+        "arm", "joint", {"q_des": (0.9, 0.8), "friction": 1e-9, "payload": 0.2}, ("load",), "payload of 0.2 kg", 20.0
+    ),
+    "a torque, and friction that is too small to matter": Failure(
+        "arm", "joint", {"q_des": (0.9, 0.8), "friction": 1e-4, "tau_ext": (0.05, 0.0)}, ("load",), "know tau_ext", 20.0
+    ),
     "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
     "degrees and a saturated motor": Failure(
         "ur5",

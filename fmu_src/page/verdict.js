@@ -76,8 +76,8 @@ export class Verdict {
     const waited = session.time(last) - session.time(this.began) >= SETTLE;
     if (missed.includes(true)) found.push(...this.reach(missed[0], waited), ...this.gains(missed), ...this.atLimits());
     if (missed.includes(true) && waited) {
-      const sticking = this.friction(); // the rate of an error tells nothing while a joint sticks
-      found.push(...this.loads(), ...sticking, ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
+      const loads = this.loads(), sticking = this.friction(loads.some(({ kind }) => kind === "load")); // the rate of an error tells nothing then
+      found.push(...loads, ...sticking, ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
       found.push(...this.damping(missed), ...this.singular(), ...(sticking.length ? [] : this.slow(missed)));
     }
     return this.ranked(found);
@@ -208,11 +208,14 @@ export class Verdict {
     });
   }
 
-  friction() {
+  /** Joints that stick; small friction also holds a joint where an unknown load balances the controller. */
+  /** @type {(loaded: boolean) => Cause[]} */
+  friction(loaded) {
     const { session } = this, stopped = this.robot.stopped(session.now), driven = stopped.length ? this.driven() : [];
     return session.held("friction").flatMap((size, i) => {
       if (stopped.includes(this.joints[i]) && !driven[i]) return [];
-      const [still, late] = size > 0 ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
+      const least = loaded ? DRAG * Math.max(...this.picked(0.25).map((k) => Math.abs(session.value("tau", k, i)))) : 0;
+      const [still, late] = size > least ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
       const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
       return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still, i)] : [];
     });

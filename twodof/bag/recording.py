@@ -115,7 +115,7 @@ class Recording:
 
     @property
     def measured(self) -> bool:
-        """Whether q and v are measured values; then /joint_states_true has the true ones."""
+        """True if q and v are measured values; then /joint_states_true has the true ones."""
         return any(topic.name.endswith(TRUE_STATES) for topic in self.topics)
 
     @cached_property

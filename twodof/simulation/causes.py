@@ -9,7 +9,7 @@ import numpy as np
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT
 from .cause import FLOOR, KINDS, Cause, point_text
-from .controller_causes import damping, feedforward, gains, load, sampled, slow
+from .controller_causes import DRAG, damping, feedforward, gains, load, sampled, slow
 from .judge import AT_LIMIT, BAND, Judge
 
 MOST = 20  # causes in a verdict
@@ -38,7 +38,8 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     ill = bool(missed) or motion == "diverging"
     if missed:
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
-        sticking = [*_friction(judge, missed)]  # the rate of an error tells nothing while a joint sticks
+        loaded = any(cause.kind == "load" for cause in found)
+        sticking = [*_friction(judge, missed, loaded)]  # the rate of an error tells nothing while a joint sticks
         found += [*sticking, *_singular(judge), *([] if sticking else slow(judge, missed))]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *sampled(judge)]
@@ -190,8 +191,9 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
             yield Cause("saturation", text, float(judge.share[i]), joint, float(t[inside[:, i].argmax()]))
 
 
-def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    setup = judge.setup
+def _friction(judge: Judge, missed: Sequence[str], loaded: bool) -> Iterator[Cause]:
+    """Yield joints that stick; small friction also holds a joint where an unknown load balances the controller."""
+    setup, tau = judge.setup, np.abs(judge.history("tau")[judge.late])
     friction, v = setup.given("friction"), np.abs(judge.end("v"))
     q, driven = judge.end("q"), _driven(judge)
     at_limit = np.minimum(np.abs(q - setup.low), np.abs(q - setup.high)) <= AT_LIMIT
@@ -200,7 +202,8 @@ def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > FLOOR if judge.wanted("q").size else bool(missed)
         moved = max(0.0, float(judge.moved[i]))
         held = judge.duration - moved > OFTEN * judge.duration
-        if friction[i] > 0.0 and off and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i]):
+        least = DRAG * tau[:, i].max() if loaded and tau.shape[1] > i else 0.0
+        if friction[i] > least and off and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i]):
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"
             text += "; raise Kp" * bool(judge.aims)
