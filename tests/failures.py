@@ -197,6 +197,25 @@ FAILURES = {
     "a torque, and friction that is too small to matter": Failure(
         "arm", "joint", {"q_des": (0.9, 0.8), "friction": 1e-4, "tau_ext": (0.05, 0.0)}, ("load",), "know tau_ext", 20.0
     ),
+    "friction of a joint that does not move the target, and a load": Failure(
+        "ur5",
+        "task",
+        {"q_start": (0.0, -1.0, 1.5, -0.5, 1.5, 0.0), "x_des": (0.45, 0.25, 0.4), "friction[6]": 0.5, "payload": 3.0},
+        ("load",),
+        "the payload of 3 kg",
+    ),
+    "a negligible torque, and too short": Failure(
+        "arm", "task", {"tau_ext": (1e-6, 0.0)}, ("time",), "time constant of 0.774 s: 2 % takes", 2.0
+    ),
+    "a feedforward that leaves no error, and too short": Failure(
+        "arm", "task", {"xdd_des": (1e-3, 0.0)}, ("time", "feedforward"), "raise Kp, or lower Kd, or stop later", 2.0
+    ),
+    "no gain where there is no error": Failure(
+        "arm", "joint", {"Kp": (0.0, 1.0), "q_des": (0.5, 0.9)}, ("time",), "time constant of 40 s"
+    ),
+    "a payload under gains that are unstable without it": Failure(
+        "arm", "task", {"control_period": 0.05, "Kd": 42.0, "payload": 0.5}, ("load",), "the payload of 0.5 kg"
+    ),
     "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
     "degrees and a saturated motor": Failure(
         "ur5",

@@ -39,6 +39,13 @@ export function decay(Kp, Kd) {
   return (Kd - Math.sqrt(Math.max(0, Kd * Kd - 4 * Kp))) / 2;
 }
 
+/** The slowest rate of decay of the loops of position or joints (0), or of orientation (1), 1/s. */
+/** @type {(session: Samples, i: number) => number} */
+export function slowest(session, i) {
+  const [Kp, Kd] = GAINS[i].map((group) => session.held(group));
+  return Math.min(...Kp.map((p, n) => (p > 0 ? decay(p, Kd[n]) : Infinity)));
+}
+
 /** Names and values of the gains of each loop; that of the self-motion has no stiffness, and moves only redundant arms. */
 /** @type {(session: Samples, joints: number) => [string, string, number[], number[]][]} */
 export function loops(session, joints) {

@@ -30,6 +30,14 @@ export class Search {
     return this.session.axes.map((axis) => end[axis]);
   }
 
+  /** A lower bound of the ratio of the smallest to the largest singular value, close to it near a singularity. */
+  /** @type {(q: number[], axes: number[]) => number} */
+  ratio(q, axes) {
+    const A = squared(this.jacobian(q, axes), 1e-18), trace = A.reduce((sum, row, i) => sum + row[i], 0);
+    const inverse = A.reduce((sum, row, i) => sum + solved(A, row.map((_, n) => Number(n === i)))[i], 0); // ≥ 1 / σ_min²
+    return 1 / Math.sqrt(inverse * trace);
+  }
+
   /** Geometric Jacobian of the end effector: a row for each joint, with its velocity, then its angular velocity. */
   /** @type {(q: number[], axes?: number[]) => number[][]} */
   jacobian(q, axes = this.session.axes) {

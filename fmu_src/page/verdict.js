@@ -1,15 +1,11 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
-import { GAINS, decay, loops, spectralRadius } from "./sampled_loop.js";
+import { BEFORE_REACH, BEFORE_TIME, FOLLOWING, MOTION, cause, forceUnit, short, speedUnit } from "./cause.js";
+import { GAINS, decay, loops, slowest, spectralRadius } from "./sampled_loop.js";
 import { Search, off, solved, squared } from "./search.js";
 
 /** @typedef {import("./robot.js").Robot} Robot */
-
-/**
- * A cause in words, and its kind, one of those in twodof/simulation/cause.py, with the share of the time or of a limit
- * by which causes of one kind are ranked, and whether it is only a consequence of another one, or of the motion.
- */
-/** @typedef {{kind: string, text: string, share: number, joint: number, noted: boolean}} Cause */
+/** @typedef {import("./cause.js").Cause} Cause */
 
 const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
 const HELD = 1e-3; // m or rad: a smaller error of an output that is held, and that only falls, is no failure
@@ -17,13 +13,11 @@ const PATIENCE = 5; // s: a run in a page goes on, so that it is slow only if it
 const SETTLE = 1; // s after a change of the target, during which only permanent causes are named
 const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the share from which on a state is a cause
 const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
-const CREEPING = 1e-5; // rad/s or m/s
-const FEWEST = 0.2; // damping ratio below which the damping is insufficient
+const STILL = 1e-3; // fraction of the largest speed below which a joint is at rest
+const CREEPING = 1e-5, FEWEST = 0.2; // rad/s or m/s, and damping ratio below which the damping is insufficient
 const TAIL = 256, FAST = 0.25; // examined last samples, and reversals in the time of a step that are too many
-const MOTION = ["effort", "velocity"], FOLLOWING = ["limit", "saturation", "singularity"], EXPLAINED = 0.1; // as in causes.py
-const BEFORE_REACH = ["degrees", "gain", "feedforward", "unstable", "load", "friction"]; // as in causes.py
+const SLIGHT = 1e-4, DRAG = 0.02, EXPLAINED = 0.1; // loads and efforts of damping, relative to the largest effort; as in causes.py
 const UNSTABLE = 1 + 1e-4, SPOILT = 0.5; // spectral radius, and rate of decay relative to that of a continuous controller
-const DRAG = 0.02; // effort of damping, relative to the largest effort, that counts
 
 export class Verdict {
   began = 0; // sample at which the target was changed
@@ -44,10 +38,10 @@ export class Verdict {
     if (!root) return [];
     if (!this.session.follows) return [root, ...others].map(({ text }) => text);
     if (!this.missed().includes(true)) return [`reached; but ${root.text}`];
-    const [first, ...rest] = this.grouped([root, ...others]), runaway = root.kind === "unstable";
+    const all = this.grouped([root, ...others]), rest = root.noted ? all : all.slice(1), runaway = root.kind === "unstable";
     /** @type {(noted: boolean, word: string) => string[]} */
     const named = (noted, word) => rest.filter((other) => other.noted === noted).map(({ text }) => `${word} ${text}`);
-    return [`not reached: ${first.text}`, ...named(false, "also"), ...(runaway ? [] : named(true, "note:"))].slice(0, 3);
+    return [root.noted ? "not reached" : `not reached: ${all[0].text}`, ...named(false, "also"), ...(runaway ? [] : named(true, "note:"))].slice(0, 3);
   }
 
   /** The worst cause of each kind with the joints of its others, and all causes without a joint. */
@@ -76,9 +70,10 @@ export class Verdict {
     const waited = session.time(last) - session.time(this.began) >= SETTLE;
     if (missed.includes(true)) found.push(...this.reach(missed[0], waited), ...this.gains(missed), ...this.atLimits());
     if (missed.includes(true) && waited) {
-      const loads = this.loads(), sticking = this.friction(loads.some(({ kind }) => kind === "load")); // the rate of an error tells nothing then
+      const loads = this.loads(), sticking = this.friction(loads.some(({ kind }) => kind === "load"));
+      const slow = sticking.length && !this.vanishing() ? [] : this.slow(missed); // else the rate of an error tells nothing
       found.push(...loads, ...sticking, ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
-      found.push(...this.damping(missed), ...this.singular(), ...(sticking.length ? [] : this.slow(missed)));
+      found.push(...this.damping(missed), ...this.singular(), ...slow);
     }
     return this.ranked(found);
   }
@@ -92,11 +87,12 @@ export class Verdict {
     const passing = ({ kind, share, joint }) => kind === "limit" && (share < motors || driven[joint]);
     /** @type {(cause: Cause) => number} */
     const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind);
-    const [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
+    const fades = found.some(({ kind }) => kind === "time") && this.vanishing(), [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
     /** @type {(cause: Cause) => number} */
-    const first = ({ kind }) => Number(near && !BEFORE_REACH.includes(kind));
+    const first = ({ kind }) => Number((near && !BEFORE_REACH.includes(kind)) || (fades && !BEFORE_TIME.includes(kind)));
     const [root, ...others] = found.sort((a, b) => first(a) - first(b) || rank(a) - rank(b) || b.share - a.share);
     const leads = ["degrees", "unstable", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
+    if (root) root.noted = MOTION.includes(root.kind) && this.missed().includes(true); // a peak makes no error
     for (const each of others) each.noted = passing(each) || MOTION.includes(each.kind) || (leads && FOLLOWING.includes(each.kind));
     const stands = others.some(({ kind, noted }) => kind === "limit" && noted);
     for (const each of others) each.noted ||= stands && each.kind === "singularity";
@@ -148,8 +144,9 @@ export class Verdict {
     return ["q_des", "q_start"].flatMap((group) => session.held(group).flatMap((value, i) => {
       const { prismatic } = joints[i], [low, high] = this.search.limits(i), meant = (value * Math.PI) / 180;
       const fits = meant >= low && meant <= high;
+      const way = group === "q_start" ? value : value - session.value("q", 0, i); // that of a continuous joint may be short
       const text = `${group}[${i + 1}] = ${short(value)} rad: ${short(value)}°? ${short(value)}° is ${short(meant)} rad`;
-      return !prismatic && Math.abs(value) > 2 * Math.PI && fits ? [cause("degrees", text)] : [];
+      return !prismatic && Math.min(Math.abs(value), Math.abs(way)) > 2 * Math.PI && fits ? [cause("degrees", text)] : [];
     }));
   }
 
@@ -183,10 +180,17 @@ export class Verdict {
     return `${group}[${i + 1}] (${where})`;
   }
 
+  /** @type {(k: number, i: number) => boolean} Whether element i of the error counts; an orientation's has none. */
+  isOff(k, i) {
+    const { session } = this, [now, wanted] = session.follows ?? ["", ""], q = session.at(now, session.count - 1);
+    const error = k ? [] : session.held(wanted).map((value, n) => Math.abs(value - q[n]));
+    return !(error[i] < 0.1 * Math.max(...error));
+  }
+
   /** @type {(missed: boolean[]) => Cause[]} */
   gains(missed) {
     const zero = GAINS.flatMap(([stiff], k) =>
-      missed[k] ? this.session.held(stiff).flatMap((gain, i) => (gain === 0 ? [this.gain(stiff, i)] : [])) : []);
+      missed[k] ? this.session.held(stiff).flatMap((gain, i) => (gain === 0 && this.isOff(k, i) ? [this.gain(stiff, i)] : [])) : []);
     const text = `${[...new Set(zero)].join(", ")} = 0: the controller does not reduce this error; raise the gain`;
     return zero.length ? [cause("gain", text)] : [];
   }
@@ -212,12 +216,14 @@ export class Verdict {
   /** @type {(loaded: boolean) => Cause[]} */
   friction(loaded) {
     const { session } = this, stopped = this.robot.stopped(session.now), driven = stopped.length ? this.driven() : [];
+    const lengths = this.search.jacobian([...session.at("q")], [...session.axes, ...(session.groups.has("quat_des") ? [3, 4, 5] : [])]).map((row) => Math.hypot(...row));
     return session.held("friction").flatMap((size, i) => {
       if (stopped.includes(this.joints[i]) && !driven[i]) return [];
       const least = loaded ? DRAG * Math.max(...this.picked(0.25).map((k) => Math.abs(session.value("tau", k, i)))) : 0;
       const [still, late] = size > least ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
+      const moves = !session.groups.has("x_des") || lengths[i] > 1e-6 * Math.max(...lengths);
       const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
-      return late > 0.9 && astray ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still, i)] : [];
+      return late > 0.9 && astray && moves ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still, i)] : [];
     });
   }
 
@@ -243,10 +249,10 @@ export class Verdict {
   /** Loads and the damping of joints, which the controller does not know. */
   loads() {
     const { session } = this, { values } = session, found = [], unknown = "the controller does not know the";
-    const payload = Number(values.get("payload") ?? 0);
-    if (payload && values.get("payload_known") !== true) found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, 1));
+    const payload = Number(values.get("payload") ?? 0), slight = SLIGHT * Math.max(...this.picked().flatMap((k) => [...session.at("tau", k)].map(Math.abs)), 0);
+    if (payload * 9.81 > slight && values.get("payload_known") !== true) found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, 1));
     for (const group of ["tau_ext", "f_ext"])
-      if (session.held(group).some(Boolean))
+      if (session.held(group).some((value) => Math.abs(value) > slight))
         found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, 0.5));
     /** @type {(own: (damping: number, i: number) => boolean) => string[]} */
     const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
@@ -276,6 +282,9 @@ export class Verdict {
     }).join(", ");
     const differences = session.values.get("v_from_q") === true;
     const loaded = Number(session.values.get("payload") ?? 0) !== 0; // a load lowers the true gains
+    /** @type {(part: number) => number} */
+    const speed = (part) => Math.max(...this.picked(part).flatMap((k) => [...session.at("v", k)].map(Math.abs)));
+    const rests = !this.robot.stopped(session.now).length && speed(0.25) <= STILL * Math.max(speed(1), FLOOR);
     const late = this.picked(0.2).map((k) => this.errors(k));
     const falls = [0, 1].map((i) => late.every((errors, k) => !k || errors[i] < late[k - 1][i]));
     const unstable = loops(session, joints.length).flatMap(([stiff, damp, Kp, Kd], k) => {
@@ -283,7 +292,7 @@ export class Verdict {
       const i = radii.indexOf(radius), rate = -Math.log(radius) / period, gains = [stiff && this.gain(stiff, i), this.gain(damp, i)].filter(Boolean);
       const slow = stiff && rate < SPOILT * decay(Kp[i], Kd[i]) && -Math.log(BAND) > PATIENCE * rate;
       const text = `${gains.join(" and ")} ${stiff ? "are" : "is"} too high for ${settings()}: the loop${stiff ? "" : " of the self-motion"} is`;
-      if ((loaded && falls[k]) || !(radius > UNSTABLE || slow)) return [];
+      if ((loaded && (rests || falls[k])) || !(radius > UNSTABLE || slow)) return [];
       return [cause("unstable", `${text} ${radius > UNSTABLE ? "unstable" : "close to unstable"}`)];
     });
     if (unstable.length) return unstable;
@@ -313,38 +322,32 @@ export class Verdict {
   singular() {
     const { session, robot } = this, axes = [...session.axes, ...(session.groups.has("quat_des") ? [3, 4, 5] : [])];
     if (!session.groups.has("x_des") || axes.length > robot.movers().length) return [];
-    const late = this.picked(0.25), near = late.filter((_, k) => k % Math.ceil(late.length / POSES) === 0).some((k) => {
-      const A = squared(this.search.jacobian([...session.at("q", k)], axes), 1e-18), trace = A.reduce((sum, row, i) => sum + row[i], 0);
-      const inverse = A.reduce((sum, row, i) => sum + solved(A, row.map((__, n) => Number(n === i)))[i], 0); // ≥ 1 / σ_min²
-      return 1 / Math.sqrt(inverse * trace) < SINGULAR;
-    });
+    const late = this.picked(0.25).filter((_, k, all) => k % Math.ceil(all.length / POSES) === 0);
+    const near = late.some((k) => this.search.ratio([...session.at("q", k)], axes) < SINGULAR);
     return near ? [cause("singularity", "the arm is near a singularity")] : [];
+  }
+
+  /** Whether each error shrinks as the gains let it, and to less than half of its last value, as a geometric sequence. */
+  vanishing() {
+    const late = this.picked(0.25), passed = this.session.time(late[late.length - 1]) - this.session.time(late[0]);
+    const three = [late[0], late[(late.length - 1) >> 1], late[late.length - 1]].map((k) => this.errors(k));
+    return this.missed().every((is, i) => {
+      const [before, middle, last] = three.map((errors) => errors[i]), bend = before - 2 * middle + last;
+      return !is || (Math.log(before / last) >= SPOILT * slowest(this.session, i) * passed && !(bend > 0 && last - (last - middle) ** 2 / bend > 0.5 * last));
+    });
   }
 
   /** Errors that still shrink, with the remaining time by their rate. */
   /** @type {(missed: boolean[]) => Cause[]} */
   slow(missed) {
     const { session } = this, late = this.picked(0.2), end = late.length - 1, passed = session.time(late[end]) - session.time(late[0]);
+    const damped = session.held("Kd"), over = session.held("Kp").some((p, i) => damped[i] > 2 * Math.sqrt(p));
     return missed.flatMap((is, i) => {
       const size = late.map((k) => this.errors(k)[i]), rate = Math.log(size[0] / size[end]) / passed;
       const left = Math.log(Math.max(size[end] / Math.max(BAND * this.way[i], FLOOR), 1)) / rate;
       const falls = is && end > 1 && size[end] > 0 && rate * passed > 1e-6 && size.every((value, k) => !k || value < size[k - 1]);
       const what = i ? "orientation still approaches" : session.groups.has("q_des") ? "joints still approach" : "position still approaches";
-      return falls && left > PATIENCE && left < 5000 * passed ? [cause("time", `the ${what}: 2 % takes about ${short(left)} s more, or raise the gains`, left)] : [];
+      return falls && left > PATIENCE && left < 5000 * passed ? [cause("time", `the ${what}: 2 % takes about ${short(left)} s more, or ${over ? "raise Kp" : "raise the gains"}`, left)] : [];
     });
   }
 }
-
-/** @type {(kind: string, text: string, share?: number, joint?: number) => Cause} */
-function cause(kind, text, share = 0, joint = -1) {
-  return { kind, text, share, joint, noted: false };
-}
-
-/** A number with four digits. */
-/** @type {(value: number) => string} */
-function short(value) {
-  return String(Number((Math.abs(value) < 1e-9 ? 0 : value).toPrecision(4))).replace("-", "\u2212");
-}
-
-/** @type {(joint: {prismatic: boolean}) => string} */
-const forceUnit = ({ prismatic }) => (prismatic ? "N" : "N·m"), speedUnit = ({ prismatic }) => (prismatic ? "m/s" : "rad/s");

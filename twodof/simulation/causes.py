@@ -9,7 +9,7 @@ import numpy as np
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT
 from .cause import FLOOR, KINDS, Cause, point_text
-from .controller_causes import DRAG, damping, feedforward, gains, load, sampled, slow
+from .controller_causes import DRAG, damping, feedforward, gains, load, sampled, slow, vanishing
 from .judge import AT_LIMIT, BAND, Judge
 
 MOST = 20  # causes in a verdict
@@ -19,6 +19,7 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
+BEFORE_TIME = ("diverged", "degrees", "time")  # kinds that precede others if the errors vanish as the gains let them
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
 BEFORE_REACH = ("diverged", "degrees", "gain", "feedforward", "unstable", "load", "friction")
 # Kinds that precede a target out of reach by less than half of the error at the end.
@@ -34,13 +35,13 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         missed: outputs that are not at their targets: "x", "quat" or "q".
         motion: motion at the end of the run.
     """
-    found = [*_degrees(judge), *_beyond_limits(judge)]
+    found, fades = [*_degrees(judge), *_beyond_limits(judge)], vanishing(judge, missed)
     ill = bool(missed) or motion == "diverging"
     if missed:
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
         loaded = any(cause.kind == "load" for cause in found)
-        sticking = [*_friction(judge, missed, loaded)]  # the rate of an error tells nothing while a joint sticks
-        found += [*sticking, *_singular(judge), *([] if sticking else slow(judge, missed))]
+        sticking = [*_friction(judge, missed, loaded)]  # then the rate of an error tells nothing, unless it is nominal
+        found += [*sticking, *_singular(judge), *(slow(judge, missed) if fades or not sticking else ())]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *sampled(judge)]
     if missed:
@@ -54,12 +55,13 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     near = any(cause.point and _excess(judge, cause) > cause.share for cause in found)
 
     def rank(cause: Cause) -> tuple[bool, int, float]:
-        first = not near or cause.kind in BEFORE_REACH
-        return not first, order.index("drag" if passing(cause) else cause.kind), -cause.share
+        late = (near and cause.kind not in BEFORE_REACH) or (fades and cause.kind not in BEFORE_TIME)
+        return late, order.index("drag" if passing(cause) else cause.kind), -cause.share
 
     if not found:
         return ()
     root, *others = sorted(found, key=rank)[:MOST]
+    root = root._replace(noted=bool(missed) and root.kind in MOTION)  # a peak makes no error
     led = [cause for cause in others if passing(cause) or _leads(root, cause, judge)]
     since = min((cause.time for cause in led if cause.time is not None), default=inf)
     led += [cause for cause in others if cause.kind == "singularity" and (cause.time or 0.0) >= since]
@@ -86,7 +88,8 @@ def _degrees(judge: Judge) -> Iterator[Cause]:
     for group in ("q_des", "q_start"):
         for i, (value, joint) in enumerate(zip(judge.given(group), setup.joints)):
             fits = setup.low[i] - AT_LIMIT <= radians(value) <= setup.high[i] + AT_LIMIT
-            if setup.units[i] == "rad" and abs(value) > LEAST_TURN and fits:
+            way = value if group == "q_start" else value - judge.first[i]  # that of a continuous joint may be short
+            if setup.units[i] == "rad" and min(abs(value), abs(way)) > LEAST_TURN and fits:
                 text = f"{group}[{i + 1}] = {value:g} rad: {value:g}°? {value:g}° is {radians(value):.4g} rad"
                 yield Cause("degrees", text, 1.0, joint)
 
@@ -135,11 +138,12 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         gap = float(np.linalg.norm(judge.end("x") - best.point[axes]))
         text += f", {gap:.4g} m from the end effector" * (gap > size)
         yield Cause("reach", text, best.distance, point=tuple(best.point.tolist()))
-    elif quat.size and "quat" in missed:
+    elif quat.size:
         best = search(quat=quat, low=setup.low, high=setup.high, q=judge.end("q"))
-        if best.angle > max(BAND * judge.aims["quat"].first, 1e-3):
+        if best.distance > size or best.angle > max(BAND * judge.aims["quat"].first, 1e-3):
             text = f"the target pose is out of reach by {best.angle:.4g} rad and {best.distance:.4g} m"
-            yield Cause("reach", text, best.angle, point=tuple(best.point.tolist()))
+            share = best.distance if best.distance > size else best.angle
+            yield Cause("reach", text, share, point=tuple(best.point.tolist()))
 
 
 def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -167,6 +171,16 @@ def _driven(judge: Judge) -> set[str]:
         pull = np.linalg.pinv(jacobian, NEAR_SINGULAR) @ (judge.wanted("x") - judge.end("x"))
     above = np.abs(q - setup.high) < np.abs(q - setup.low)
     return {joint for joint, away in zip(setup.joints, np.where(above, pull < 0.0, pull > 0.0)) if away}
+
+
+def _idle(judge: Judge) -> set[str]:
+    """Return the joints that do not move the end effector towards a target, at the end."""
+    setup = judge.setup
+    if not _chain(judge):
+        return set()
+    rows = [*setup.rows, *((3, 4, 5) if judge.wanted("quat").size else ())]
+    lengths = np.linalg.norm(setup.kinematics.jacobian(setup.frame, judge.end("q")[None])[0, rows], axis=0)
+    return {joint for joint, length in zip(setup.joints, lengths) if length <= 1e-6 * lengths.max()}
 
 
 def _chain(judge: Judge) -> list[Joint]:
@@ -197,12 +211,14 @@ def _friction(judge: Judge, missed: Sequence[str], loaded: bool) -> Iterator[Cau
     friction, v = setup.given("friction"), np.abs(judge.end("v"))
     q, driven = judge.end("q"), _driven(judge)
     at_limit = np.minimum(np.abs(q - setup.low), np.abs(q - setup.high)) <= AT_LIMIT
+    idle = _idle(judge)
     pressed = {i for i, joint in enumerate(setup.joints) if at_limit[i] and joint not in driven}
     for i, joint in enumerate(setup.joints[: len(friction)]):
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > FLOOR if judge.wanted("q").size else bool(missed)
         moved = max(0.0, float(judge.moved[i]))
         held = judge.duration - moved > OFTEN * judge.duration
         least = DRAG * tau[:, i].max() if loaded and tau.shape[1] > i else 0.0
+        off = off and joint not in idle
         if friction[i] > least and off and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i]):
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"

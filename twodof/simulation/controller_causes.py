@@ -7,14 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from .cause import FLOOR, MANY_CHANGES, Cause, point_text
-from .judge import BAND, Judge
+from .judge import AT_LIMIT, BAND, Judge
 from .sampled_loop import quickest_gains, spectral_radius, stable_gains
 
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
-OVERDAMPED = 5.0  # damping ratio from which on less damping is quicker
+SLIGHT = 1e-4  # torque, relative to the largest effort, below which a load does not count
+LEVER = 1.0  # m: of a force at the end effector
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 GAINS = (("Kp", "Kd"), ("Kp_rot", "Kd_rot"))
 SPOILT = 0.5  # fraction of the rate of decay of a continuous controller below which the sampling is to blame
+STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
+OF_ERROR = 0.1  # part of the largest element of an error from which on an element counts
+GRAVITY = 9.81  # m/s²
 DRAG = 0.02  # effort of damping, relative to the largest effort in the last quarter, that counts
 
 
@@ -34,19 +38,32 @@ def gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     for name in missed:
         group, error = ("Kp_rot", "orientation") if name == "quat" else ("Kp", "position" if name == "x" else "joints")
         values = judge.given(group)
-        zero = list(dict.fromkeys(_gain(judge, group, i) for i, gain in enumerate(values) if gain == 0.0))
+        off = np.ones(len(values), bool)  # an orientation's error has no elements in the samples
+        if name != "quat" and len(e := np.abs(judge.wanted(name) - judge.end(name))) == len(values):
+            off = e >= OF_ERROR * e.max()
+        zero = list(dict.fromkeys(_gain(judge, group, i) for i, gain in enumerate(values) if gain == 0.0 and off[i]))
         if zero:
             text = f"{', '.join(zero)} = 0: the controller does not reduce the error of the {error}; raise the gain"
             yield Cause("gain", text, 1.0)
 
 
 def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    """Yield target velocities and accelerations that are not 0, while the target rests."""
+    """Yield target velocities and accelerations that are not 0 while the target rests, and 0 while it moves."""
     groups = {"x": ("xd_des", "xdd_des"), "quat": ("omega_des", "alpha_des"), "q": ("v_des", "a_des")}
     for group in (group for name in missed for group in groups[name]):
         values = judge.given(group)
         if values.any() and judge.changes <= MANY_CHANGES:
             yield Cause("feedforward", f"{group} = {point_text(values)} is not 0, while the target rests", 1.0)
+    for stiff, damp, group in (
+        ("Kp", "Kd", groups["q" if "q" in missed else "x"][0]),
+        ("Kp_rot", "Kd_rot", "omega_des"),
+    ):
+        of = "quat" if stiff == "Kp_rot" else "q" if "q" in missed else "x"
+        lags = [d / p for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
+        still = not judge.given(group).any() and f"{group}[1]" not in judge.inputs
+        if of in missed and judge.changes > MANY_CHANGES and still and lags:
+            text = f"the target moves, and {group} is 0: the lag is {damp}/{stiff} = {max(lags):.3g} s"
+            yield Cause("feedforward", f"{text}; set {group}, raise {stiff} or lower {damp}", 0.5)
 
 
 def load(judge: Judge) -> Iterator[Cause]:
@@ -54,7 +71,7 @@ def load(judge: Judge) -> Iterator[Cause]:
     payload, switch = judge.held.get("payload"), "payload_known"
     own = next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
     payload, believed = payload or 0.0, judge.held.get(f"{own}payload", 0.0) if judge.held.get(switch) else 0.0
-    if payload and believed != payload:
+    if payload and believed != payload and _matters(judge, payload * GRAVITY * LEVER):
         remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
         yield Cause("load", f"the controller does not know the payload of {payload:g} kg; {remedy}", 1.0)
     elif believed != payload:
@@ -62,7 +79,8 @@ def load(judge: Judge) -> Iterator[Cause]:
         yield Cause("load", text, 1.0)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
-    heavy = [name for name, d in zip(usual, judge.given("damping")) if d > 2.0 * usual[name]]
+    given = zip(usual, judge.given("damping"), judge.speed)
+    heavy = [name for name, d, speed in given if d > 2.0 * usual[name] and _matters(judge, d * speed)]
     each = heavy or [name for name in usual if usual[name] > 0.0]
     names = "of any joint" if len(each) == len(usual) > 2 else f"of joints {', '.join(map(repr, each))}"
     kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.0)
@@ -70,8 +88,13 @@ def load(judge: Judge) -> Iterator[Cause]:
         yield Cause(kind, f"the controller does not know the damping {names}{tail}", share)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
-        if values.any():
+        if values.any() and _matters(judge, np.abs(values).max() * (LEVER if group == "f_ext" else 1.0)):
             yield Cause("load", f"the controller does not know {group} = {point_text(values)}{unit}", 0.5)
+
+
+def _matters(judge: Judge, torque: float) -> bool:
+    """Return whether a torque, N·m, is not negligible beside the largest effort."""
+    return torque > SLIGHT * judge.effort.max(initial=0.0)
 
 
 def _drags(judge: Judge) -> bool:
@@ -85,6 +108,8 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     """Yield sampled loops that are unstable, or else a joint that reverses as fast as the steps."""
     v, setup = judge.tail("v")[-256:], judge.setup
     sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
+    if not any(sampling) and any(name.endswith(".control_period") for name in setup.starts):
+        sampling = [setup.step, 0.0]  # the controller is a component, and acts at communication points
     continuous = bool(judge.aims) and not any(sampling) and judge.changes <= MANY_CHANGES
     if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
         return
@@ -145,8 +170,8 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
     every = [*_loops(judge, period, delay)]
     for group, output in (("Kp", "q" if "q" in judge.aims else "x"), ("Kp_rot", "quat"), ("", "")):
         loop = max((loop for loop in every if loop.stiff == group), default=None)
-        if loop is None or (judge.held.get("payload") and _rate(judge, output) > 0.0):  # a load lowers the true gains
-            continue
+        if loop is None or (judge.held.get("payload") and (_rests(judge) or _rate(judge, output) > 0.0)):
+            continue  # a load lowers the true gains
         rate = -log(loop.radius) / period
         if loop.radius > UNSTABLE:
             state = f"the loop{'' if group else ' of the self-motion'} is unstable, "
@@ -158,7 +183,9 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
             continue
         gains, are = " and ".join(_named(judge, loop, (" s⁻²", " s⁻¹"))), "are" if group else "is"
         late = f" and control_delay = {delay:g} s" * bool(delay)
-        text = f"{gains} {are} too high for control_period = {period:g} s{late}: {state}"
+        own = bool(judge.setup.starts.get("control_period"))
+        step = f"control_period = {period:g} s" if own else f"communication steps of {period:g} s"
+        text = f"{gains} {are} too high for {step}{late}: {state}"
         yield Cause("unstable", text + _better(judge, loop, period, delay), -rate)
 
 
@@ -174,6 +201,13 @@ def _better(judge: Judge, loop: _Loop, period: float, delay: float) -> str:
     )
     stable = f"stable below {' with '.join(below)}, and " if loop.radius > UNSTABLE else ""
     return f"; {'at the same damping ratio ' * bool(loop.stiff)}it is {stable}quickest with {' and '.join(quick)}"
+
+
+def _rests(judge: Judge) -> bool:
+    """Return whether the joints rest late in the run, away from their limits."""
+    setup, q, v = judge.setup, judge.end("q"), np.abs(judge.history("v")[judge.late])
+    inside = (np.minimum(q - setup.low, setup.high - q) > AT_LIMIT).all()
+    return bool(inside and v.max(initial=0.0) <= STILL * max(float(judge.speed.max()), FLOOR))
 
 
 def _decay(loop: _Loop) -> float:
@@ -193,6 +227,8 @@ def _sampling(judge: Judge, i: int) -> Iterator[str]:
     for name, of in ((f"q_noise[{i + 1}]", unit), (f"v_noise[{i + 1}]", f"{unit}/s")):
         if starts.get(name):
             yield f"{name} = {starts[name]:g} {of}"
+    if (noise := starts.get(f"q_noise[{i + 1}]")) and period and starts.get("v_from_q"):
+        yield f"so velocities with a noise of {sqrt(2.0) * noise / period:.4g} {unit}/s"
 
 
 def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -218,8 +254,28 @@ def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
             stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
             ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
-            remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > OVERDAMPED else "raise the gains"
+            remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > 1.0 else "raise the gains"
             yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; {remedy}, or stop later", left)
+
+
+def vanishing(judge: Judge, missed: Sequence[str]) -> bool:
+    """Return whether each error shrinks as the gains let it, and towards less than half of its last value.
+
+    The limit of a geometric sequence is e₂ − (e₂ − e₁)²/(e₀ − 2 e₁ + e₂) (Aitken, 1926).
+    """
+    for name in missed:
+        size = np.array(judge.error_history(name))[judge.late]
+        before, middle, last = size[:: max(1, (len(size) - 1) // 2)][:3] if len(size) > 2 else (0.0, 0.0, 1.0)
+        bend = before - 2.0 * middle + last
+        group = "Kp_rot" if name == "quat" else "Kp"
+        rates = [_decay(loop) for loop in _loops(judge, 1.0, 0.0) if loop.stiff == group and loop.Kp > 0.0]
+        if (
+            not rates
+            or _rate(judge, name) < SPOILT * min(rates)
+            or (bend > 0.0 and last - (last - middle) ** 2 / bend > 0.5 * last)
+        ):
+            return False
+    return bool(missed)
 
 
 def _rate(judge: Judge, name: str) -> float:

@@ -6,9 +6,9 @@ from math import inf
 import numpy as np
 
 from .cause import FLOOR, Cause, point_text
+from .controller_causes import STILL
 from .judge import AT_LIMIT, SMALLEST_MOVE, Judge
 
-STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
 MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
 RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
@@ -34,13 +34,13 @@ def lines_of(
     off = ", ".join(_distances(judge, numbers))
     head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
     causes = _grouped(why, len(judge.setup.joints))
-    if why:
+    if why and not why[0].noted:
         but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
         head += f"{but}{causes[0].text}"
     elif outcome.startswith("not"):
         head += "; no cause is seen in the samples"
     also = [f"also {cause.text}" for cause in causes[1:] if not cause.noted]
-    notes = [f"note: {cause.text}" for cause in causes[1:] if cause.noted and why[0].kind not in RUNAWAY]
+    notes = [f"note: {cause.text}" for cause in causes if cause.noted and why[0].kind not in RUNAWAY]
     settings = _settings(judge) if outcome.startswith("not") else ""
     lines = [
         head,
