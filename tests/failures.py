@@ -204,6 +204,26 @@ FAILURES = {
         ("load",),
         "the payload of 3 kg",
     ),
+    "close to a singularity that does not matter, and too short": Failure(
+        "arm",
+        "task",
+        {"q_start": (0.3, 0.07), "x_des": (0.28714, 0.0866)},
+        ("time",),
+        "the position still approaches",
+        2.0,
+    ),
+    "a limit that does not matter, and too short": Failure(
+        "ur5",
+        "task",
+        {
+            "q_start": (0.0, -1.0, 1.5, -0.5, 1.5, 0.0),
+            "x_des": (0.45, 0.25, 0.4),
+            "q_max": (6.0, 6.0, 6.0, -0.4, 6.0, 6.0),
+        },
+        ("time",),
+        "the position still approaches",
+        2.0,
+    ),
     "a negligible torque, and too short": Failure(
         "arm", "task", {"tau_ext": (1e-6, 0.0)}, ("time",), "time constant of 0.774 s: 2 % takes", 2.0
     ),

@@ -117,7 +117,7 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
         (LATE, "at the same damping ratio it is stable below Kp = 189 with Kd = 22.9, and quickest with"),
         (
             {**NOISY, "Kp": 900.0},
-            "joint 'joint1' reverses every 0.034 s: the gains (Kp = 900, Kd = 60) are too high for",
+            "joint 'joint1' reverses every 0.034 s: q_noise[1] = 0.01 rad: too much for the gains (Kp = 900, Kd = 60)",
         ),
         (
             {**NOISY, "Kp": (900.0, 0.0)},
@@ -172,6 +172,22 @@ def test_a_load_that_slows_a_sampled_loop_makes_it_stable() -> None:
         and "the payload of 0.5 kg" in lines[1]
         and not any("unstable" in line for line in lines)
     )
+
+
+def test_a_good_run_of_a_continuous_joint_beyond_a_turn_is_not_in_degrees() -> None:
+    settings = {"q_start[1]": 6.1, "q_des[1]": 6.4, "max_step": 0.01}
+    verdict = twodof.simulate(fmu_of("kinova", "joint"), settings=settings).verdict
+    assert verdict.outcome == "reached" and not verdict.causes
+
+
+def test_a_moving_target_whose_velocity_the_controller_does_not_know() -> None:
+    """The lag of a critically damped or overdamped loop is Kd/Kp for slow motions; a higher Kp follows."""
+    times = np.arange(0.0, 6.0, 0.05)
+    moves = [(t, {"q_des[1]": 0.5 + 0.3 * np.sin(t), "q_des[2]": 0.25}) for t in times]
+    slow = twodof.simulate(fmu_of("arm", "joint"), changes=moves, stop_time=6.0).verdict
+    assert "the target moves, and v_des is 0: the lag is Kd/Kp = 0.8 s; set v_des, raise Kp" in slow.lines[0]
+    quick = twodof.simulate(fmu_of("arm", "joint"), changes=moves, stop_time=6.0, settings={"Kp": 2000.0}).verdict
+    assert quick.outcome == "followed" and not quick.causes
 
 
 def test_a_push_that_only_shows_in_peaks_is_no_cause() -> None:

@@ -9,13 +9,11 @@ import { Search, off, solved, squared } from "./search.js";
 
 const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
 const HELD = 1e-3; // m or rad: a smaller error of an output that is held, and that only falls, is no failure
-const PATIENCE = 5; // s: a run in a page goes on, so that it is slow only if it takes longer
-const SETTLE = 1; // s after a change of the target, during which only permanent causes are named
+const PATIENCE = 5, SETTLE = 1; // s: of a run that goes on, and after a change of the target for permanent causes only
 const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the share from which on a state is a cause
 const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
-const STILL = 1e-3; // fraction of the largest speed below which a joint is at rest
-const CREEPING = 1e-5, FEWEST = 0.2; // rad/s or m/s, and damping ratio below which the damping is insufficient
-const TAIL = 256, FAST = 0.25; // examined last samples, and reversals in the time of a step that are too many
+const STILL = 1e-3, CREEPING = 1e-5, FEWEST = 0.2; // part of the largest speed, and rad/s or m/s, at rest; damping ratio
+const TAIL = 256, FAST = 0.25, FADING = 0.7; // examined last samples, reversals in a step that are too many, and decay of the speed
 const SLIGHT = 1e-4, DRAG = 0.02, EXPLAINED = 0.1; // loads and efforts of damping, relative to the largest effort; as in causes.py
 const UNSTABLE = 1 + 1e-4, SPOILT = 0.5; // spectral radius, and rate of decay relative to that of a continuous controller
 
@@ -299,8 +297,8 @@ export class Verdict {
     const turns = joints.map((_, i) => {
       const v = Array.from({ length: last + 1 - first }, (__, k) => session.value("v", first + k, i));
       const peak = Math.max(...this.picked().map((k) => Math.abs(session.value("v", k, i))), 1e-3);
-      const moves = v.reduce((sum, value) => sum + Math.abs(value), 0) / v.length > 1e-3 * peak;
-      return moves ? v.filter((value, k) => k && value * v[k - 1] < 0).length / (v.length - 1) : 0;
+      const mean = (/** @type {number[]} */ part) => part.reduce((sum, value) => sum + Math.abs(value), 0) / part.length, half = v.length >> 1;
+      return mean(v) > 1e-3 * peak && mean(v.slice(half)) > FADING * mean(v.slice(0, half)) ? v.filter((value, k) => k && value * v[k - 1] < 0).length / (v.length - 1) : 0;
     });
     const most = Math.max(...turns), joint = turns.indexOf(most), step = this.robot.facts.step;
     const often = `joint '${joints[joint].name}' reverses every ${short(step / most)} s`;
@@ -322,8 +320,7 @@ export class Verdict {
   singular() {
     const { session, robot } = this, axes = [...session.axes, ...(session.groups.has("quat_des") ? [3, 4, 5] : [])];
     if (!session.groups.has("x_des") || axes.length > robot.movers().length) return [];
-    const late = this.picked(0.25).filter((_, k, all) => k % Math.ceil(all.length / POSES) === 0);
-    const near = late.some((k) => this.search.ratio([...session.at("q", k)], axes) < SINGULAR);
+    const near = this.picked(0.25).filter((_, k, all) => k % Math.ceil(all.length / POSES) === 0).some((k) => this.search.ratio([...session.at("q", k)], axes) < SINGULAR);
     return near ? [cause("singularity", "the arm is near a singularity")] : [];
   }
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT
-from .cause import FLOOR, KINDS, Cause, point_text
+from .cause import FLOOR, KINDS, MANY_CHANGES, Cause, point_text
 from .controller_causes import DRAG, damping, feedforward, gains, load, sampled, slow, vanishing
 from .judge import AT_LIMIT, BAND, Judge
 
@@ -35,13 +35,14 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         missed: outputs that are not at their targets: "x", "quat" or "q".
         motion: motion at the end of the run.
     """
-    found, fades = [*_degrees(judge), *_beyond_limits(judge)], vanishing(judge, missed)
+    found, rests = [*_degrees(judge), *_beyond_limits(judge)], judge.changes <= MANY_CHANGES
+    fades = rests and vanishing(judge, missed)  # errors from a target that rests
     ill = bool(missed) or motion == "diverging"
     if missed:
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
         loaded = any(cause.kind == "load" for cause in found)
         sticking = [*_friction(judge, missed, loaded)]  # then the rate of an error tells nothing, unless it is nominal
-        found += [*sticking, *_singular(judge), *(slow(judge, missed) if fades or not sticking else ())]
+        found += [*sticking, *_singular(judge), *(slow(judge, missed) if fades or (rests and not sticking) else ())]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *sampled(judge)]
     if missed:

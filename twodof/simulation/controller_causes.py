@@ -13,6 +13,8 @@ from .sampled_loop import quickest_gains, spectral_radius, stable_gains
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 SLIGHT = 1e-4  # torque, relative to the largest effort, below which a load does not count
 LEVER = 1.0  # m: of a force at the end effector
+PERIODS = ("control_period", "control_delay")
+FADING = 0.7  # ratio of mean speeds, of the second to the first half of the last samples, that shows a decay
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 GAINS = (("Kp", "Kd"), ("Kp_rot", "Kd_rot"))
 SPOILT = 0.5  # fraction of the rate of decay of a continuous controller below which the sampling is to blame
@@ -107,7 +109,7 @@ def _drags(judge: Judge) -> bool:
 def sampled(judge: Judge) -> Iterator[Cause]:
     """Yield sampled loops that are unstable, or else a joint that reverses as fast as the steps."""
     v, setup = judge.tail("v")[-256:], judge.setup
-    sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
+    sampling = [setup.starts.get(name, 0.0) for name in PERIODS]
     if not any(sampling) and any(name.endswith(".control_period") for name in setup.starts):
         sampling = [setup.step, 0.0]  # the controller is a component, and acts at communication points
     continuous = bool(judge.aims) and not any(sampling) and judge.changes <= MANY_CHANGES
@@ -118,13 +120,18 @@ def sampled(judge: Judge) -> Iterator[Cause]:
         return
     turns = (np.sign(v[1:]) * np.sign(v[:-1]) < 0.0).mean(axis=0)
     turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
+    before, after = (np.abs(half).mean(axis=0) for half in (v[: len(v) // 2], v[len(v) // 2 :]))
+    turns[(after < FADING * before) & bool(judge.aims)] = 0.0
     i = int(turns.argmax())
     if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
         gains = f"the gains{_fastest(judge, *sampling)}"
         gains = gains if judge.aims else "the gains of the controller outside"
-        what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
-        text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: {gains} are too high"
-        yield Cause("sampling", f"{text} for {what}", float(turns[i]), setup.joints[i])
+        period = [f"{name} = {setup.starts[name]:g} s" for name in PERIODS if setup.starts.get(name)]
+        what = " and ".join(period) or f"communication steps of {setup.step:g} s"
+        sensors = ", ".join(_sensors(judge, i))
+        text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: "
+        text += f"{sensors}: too much for {gains} at {what}" if sensors else f"{gains} are too high for {what}"
+        yield Cause("sampling", text, float(turns[i]), setup.joints[i])
 
 
 class _Loop(NamedTuple):
@@ -215,13 +222,12 @@ def _decay(loop: _Loop) -> float:
     return float(-np.roots([1.0, loop.Kd, loop.Kp]).real.max())
 
 
-def _sampling(judge: Judge, i: int) -> Iterator[str]:
-    """Yield the settings of a sampled controller and of the sensors of joint i."""
+def _sensors(judge: Judge, i: int) -> Iterator[str]:
+    """Yield the settings of the sensors of joint i."""
     starts, unit = judge.setup.starts, judge.setup.units[i]
     period, coarse = starts.get("control_period", 0.0), starts.get(f"q_resolution[{i + 1}]", 0.0)
-    for name, of in (("control_period", "s"), ("control_delay", "s"), (f"q_resolution[{i + 1}]", unit)):
-        if starts.get(name):
-            yield f"{name} = {starts[name]:g} {of}"
+    if coarse:
+        yield f"q_resolution[{i + 1}] = {coarse:g} {unit}"
     if coarse and period and starts.get("v_from_q"):
         yield f"so velocities in steps of {coarse / period:.4g} {unit}/s"
     for name, of in ((f"q_noise[{i + 1}]", unit), (f"v_noise[{i + 1}]", f"{unit}/s")):
