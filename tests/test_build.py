@@ -1,8 +1,10 @@
 """The FMU's files: description, digest, reproducibility, and dependencies of variables."""
 
 import hashlib
+import io
 import os
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -190,6 +192,30 @@ def test_an_fmu_that_is_up_to_date_is_left_alone(fmu_path, tmp_path):
     assert path.stat().st_mtime == 1e9
     build_fmu(path, FmuOptions(gravity=(0.0, 0.0, 0.0)))
     assert path.stat().st_mtime > 1e9
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_a_doctored_fmu_does_not_count_as_the_one_that_is_built(native, tmp_path):
+    """Its code would run, though the user named a URDF only. The default arm's FMU is made again."""
+    urdf = Path(shutil.copy(data_file("urdf", "2dof.urdf"), tmp_path / "my.urdf"))
+    robot = FmuOptions(urdf=urdf, native=native, meshes=False)
+    for options in (robot, FmuOptions(native=native)):
+        path = tmp_path / "A.fmu"
+        path.unlink(missing_ok=True)
+        good = build_fmu(path, options).read_bytes()
+        for part in ("resources/", "binaries/linux64/"):
+            with zipfile.ZipFile(io.BytesIO(good)) as archive, zipfile.ZipFile(path, "w") as other:
+                other.comment = archive.comment
+                names = archive.namelist()
+                victim = next(name for name in names if name.startswith(part))
+                for name in names:
+                    other.writestr(name, archive.read(name) + b"\n" * (name == victim))
+            doctored = path.read_bytes()
+            if options is robot:
+                with pytest.raises(TwoDofError, match=r"A\.fmu' has the description of this FMU and other contents"):
+                    build_fmu(path, options)
+                assert path.read_bytes() == doctored
+            assert build_fmu(path, options, overwrite=options is robot).read_bytes() == good
 
 
 def test_an_fmu_of_other_settings_is_replaced_on_request_alone(fmu_path, tmp_path):

@@ -103,12 +103,12 @@ def test_a_new_cache_is_for_its_user_alone(tmp_path, monkeypatch):
     try:
         cache = compiler.zig_cache()
         assert cache is not None
-        compiler._keep(cache / "twodof" / "key", b"content")
+        compiler.remember(cache / "twodof" / "key", b"content")
     finally:
         os.umask(before)
     modes = [path.stat().st_mode & 0o777 for path in (cache, *cache.rglob("*"))]
     assert modes == [0o700, 0o700, 0o600]
-    assert compiler._kept(cache / "twodof" / "key") == b"content"
+    assert compiler.remembered(cache / "twodof" / "key") == b"content"
 
 
 def test_a_missing_home_for_the_cache_is_reported(monkeypatch, caplog):

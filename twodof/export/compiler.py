@@ -67,6 +67,7 @@ WINDOWS = "windows.c"
 """The additional C file of a library for Windows."""
 WINDOWS_RUNTIME = ("math", "heap", "stdio", "string", "private")
 """Parts of the Universal C Runtime, which Windows includes since version 10."""
+FOLDER = "twodof"  # in the cache
 KEPT_FOR = 30 * 86400.0
 """s after which an unused library is removed from the cache."""
 DIGEST = hashlib.sha256().digest_size
@@ -203,25 +204,23 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str, 
             cache = zig_cache()
             environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache or folder / "zig-cache")
             environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # for these sources only
-            if cache:
-                made_of = hashlib.sha256(repr((version("ziglang"), *command, output)).encode())
-                for file, content in sorted(sources.items()):
-                    made_of.update(repr((file, len(content))).encode() + content)
-                kept = cache / "twodof" / made_of.hexdigest()
-                content = _kept(kept)
-                if content is not None:
-                    return content
+            made_of = hashlib.sha256(repr((version("ziglang"), *command, output)).encode())
+            for file, content in sorted(sources.items()):
+                made_of.update(repr((file, len(content))).encode() + content)
+            kept = cache / FOLDER / made_of.hexdigest() if cache else None
+            if kept and (known := remembered(kept)) is not None:
+                return known
         for file, content in sources.items():
             write_file(folder / file, content)
         (run or _run)([*command, "-o", str(folder / output)], folder, environment)
         content = (folder / output).read_bytes()
         if kept:
-            _keep(kept, content)
+            remember(kept, content)
         return content
 
 
-def _kept(file: Path) -> bytes | None:
-    """Return the content of a cache file; None if it is missing or damaged."""
+def remembered(file: Path) -> bytes | None:
+    """Return the content of a file in the user's cache; None if it is missing or damaged, or others can write it."""
     try:
         if not _is_ours(file):
             return None
@@ -233,8 +232,8 @@ def _kept(file: Path) -> bytes | None:
     return content if hashlib.sha256(content).digest() == digest else None
 
 
-def _keep(file: Path, content: bytes) -> None:
-    """Store content in the cache if there is room, and remove entries that were not used for long."""
+def remember(file: Path, content: bytes) -> None:
+    """Store content in the user's cache if there is room, and remove entries that were not used for long."""
     with suppress(OSError):
         file.parent.mkdir(mode=0o700, exist_ok=True)
         write_file(file, hashlib.sha256(content).digest() + content)
@@ -280,8 +279,8 @@ def _compile_in_child(pipe: Connection, command: Sequence[str], home: Path, fold
     pipe.send_bytes(json.dumps([done.returncode, done.stderr.strip()[-MAX_COMPILER_TEXT // 8 :]]).encode())
 
 
-def zig_cache() -> Path | None:
-    """Return the folder in which zig caches its C library; None if the home folder has no room.
+def zig_cache(*, silent: bool = False) -> Path | None:
+    """Return the folder in which zig caches its C library; None, with a warning, if the home folder has no room.
 
     Raises:
         BuildError: the folder in ``ZIG_GLOBAL_CACHE_DIR`` cannot be made.
@@ -302,10 +301,9 @@ def zig_cache() -> Path | None:
                 f"zig cannot use the cache '{named}' of ZIG_GLOBAL_CACHE_DIR: {reason}; name another folder"
             ) from error
         fault = f"it has no folder for its cache ({error})"
-    if fault:
+    if fault and not silent:
         LOG.warning("zig compiles the C library each time: %s; name another folder in ZIG_GLOBAL_CACHE_DIR", fault)
-        return None
-    return cache
+    return None if fault else cache
 
 
 def _is_ours(path: Path, writers: int = 0o022) -> bool:

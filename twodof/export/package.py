@@ -13,7 +13,7 @@ from ..files import check_archive, data_file, descriptor_of, refusing, write_fil
 from ..notebook import busy
 from ..plant.urdf import RobotError
 from ..version import versions
-from .compiler import compiles_for_the_web, host_platform
+from .compiler import FOLDER, compiles_for_the_web, host_platform, remember, remembered, zig_cache
 from .fmu_options import FmuOptions
 
 MADE_OF = ("fmu_src", "urdf", "meshes", "export", "plant")
@@ -51,30 +51,63 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = path_of(default if output is None else output, "FMU")
     comment = DEFAULT_ARM if options.is_default_arm else b""
-    made_of = options.native and options.urdf is None
-    if made_of:
+    if options.native and options.urdf is None:
         comment += _shipped(options)
-    if made_of and _fits(path, lambda zipped: zipped.comment == comment):
-        return path
+        if _is_known(path, comment):
+            return path
     from .composition import compose  # the import of Pinocchio and SciPy takes most of a run's time
 
     try:
         flavour, files, finish = compose(options)
         built = files["modelDescription.xml"], flavour.platforms, options.reference
-        same = _fits(path, lambda zipped: _holds(zipped, *built))
-        there = path.is_file() and descriptor_of(path) is None  # /dev/stdout is written into
-        if there and not (same or overwrite or is_default_arm(path)):
-            raise BuildError(
-                f"'{path}' is {'another' if is_fmu(path) else 'not an'} FMU, and is not replaced: move"
-                " it away, or build with another `output` or with `overwrite=True`"
-            )
-        if made_of or not same:
-            content = _zipped({**files, **finish()}, comment)
-            with refusing(BuildError, f"write '{path}'"):
+        key = repr((built, comment)).encode()
+        if options.native and _is_known(path, key):
+            return path
+        replaced = overwrite or not path.is_file() or descriptor_of(path) is not None or is_default_arm(path)
+        if not replaced and not _fits(path, lambda zipped: _holds(zipped, *built)):
+            raise _other(path, f"is {'another' if is_fmu(path) else 'not an'} FMU")
+        members = {**files, **finish()}
+        if not replaced and not _fits(path, lambda zipped: _contents(zipped) == members):
+            raise _other(path, "has the description of this FMU and other contents: it was changed, or others built it")
+        content = _zipped(members, comment)
+        with refusing(BuildError, f"write '{path}'"):
+            if not _has(path, content):
                 write_file(path, content)
+        if options.native:
+            for known in filter(None, map(_known, (comment, key))):
+                remember(known, hashlib.sha256(content).digest())
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     return path
+
+
+def _is_known(path: Path, key: bytes) -> bool:
+    """Return whether a file is the one that was built last for a key, by the digest in the user's own cache.
+
+    An FMU's code runs, so that what the file itself states does not count.
+    """
+    known = _known(key)
+    digest = remembered(known) if known else None
+    return digest is not None and _fits(path, lambda _: hashlib.sha256(path.read_bytes()).digest() == digest)
+
+
+def _known(key: bytes) -> Path | None:
+    """Return the file with the digest of the FMU of a key; None without a cache."""
+    cache = zig_cache(silent=True)
+    return cache / FOLDER / hashlib.sha256(key).hexdigest() if cache else None
+
+
+def _has(path: Path, content: bytes) -> bool:
+    return path.is_file() and descriptor_of(path) is None and path.read_bytes() == content
+
+
+def _contents(archive: zipfile.ZipFile) -> dict[str, bytes]:
+    return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _other(path: Path, what: str) -> BuildError:
+    remedy = "move it away, or build with another `output` or with `overwrite=True`"
+    return BuildError(f"'{path}' {what}, and is not replaced: {remedy}")
 
 
 def _build_system(output: str | Path | None, options: FmuOptions, *, overwrite: bool) -> Path:
