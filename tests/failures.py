@@ -236,6 +236,17 @@ FAILURES = {
     "a payload under gains that are unstable without it": Failure(
         "arm", "task", {"control_period": 0.05, "Kd": 42.0, "payload": 0.5}, ("load",), "the payload of 0.5 kg"
     ),
+    "too little damping, seen in the first swing": Failure(
+        "arm", "joint", {"Kp": 1.0, "Kd": 0.2, "q_des": (0.8, 0.6)}, ("damping",), "Kd = 0.2 s⁻¹ damps Kp = 1 s⁻²", 1.3
+    ),
+    "an unstable loop that has hardly grown": Failure(
+        "arm",
+        "joint",
+        {"control_period": 0.05, "Kd": (45.0, 30.0), "q_des": (0.5, 0.6)},
+        ("unstable",),
+        "Kd[1] (of joint 'joint1') = 45 s⁻¹ are too high",
+        1.0,
+    ),
     "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
     "degrees and a saturated motor": Failure(
         "ur5",

@@ -58,6 +58,7 @@ def test_the_rest_of_a_killed_run_is_removed_by_the_next_and_nothing_else(native
     others.mkdir()
     (tmp_path / f"{TEMPORARY}link").symlink_to(others)
     (tmp_path / f"{TEMPORARY}file").touch()
+    (tmp_path / f"{TEMPORARY}notes").mkdir()
     if foreign:
         needs("root")
         (tmp_path / f"{TEMPORARY}foreign").mkdir()

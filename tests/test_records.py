@@ -60,6 +60,7 @@ MCAPS = {
     "message of an unknown channel": HEADER + message(b"") + FOOTER,
     "message shorter than its head": TOPIC + chunk(record(5, b"\x01"), 10, "") + FOOTER,
     "message of the year 2400": TOPIC + message(bytes(4), stamp=2**63 + 2**62) + FOOTER,
+    "channel of two topics": TOPIC + channel(1, "/other") + message(bytes(4)) + FOOTER,
     "channel of an unknown schema": HEADER + CHANNEL + FOOTER,
     "chunk in a chunk": HEADER + chunk(chunk(CHANNEL, 1, ""), 1, "") + FOOTER,
     "joint state that is none": TOPIC + message(b"junk") + FOOTER,
@@ -191,6 +192,16 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
     file.write_bytes(TOPIC + about + message(joint_state(2, START)) + FOOTER)
     assert main(["info", str(file)]) == 1
     assert "has metadata 'twodof' of 335" in capsys.readouterr().err
+
+
+def test_joint_states_that_are_decoded_one_by_one_are_limited(bag, monkeypatch):
+    """They differ in frame; each takes 20 µs, and with many names milliseconds."""
+    frames = [serialised(joint_message(t, ["a", "b"], [0.0, 1.0], frame="x" * (t % 2))) for t in range(40)]
+    (bag / "bag.mcap").write_bytes(TOPIC + b"".join(message(data, t) for t, data in enumerate(frames)) + FOOTER)
+    assert len(twodof.read_bag(bag).t) == 40
+    monkeypatch.setattr(reader, "MAX_ODD", 1000)
+    with pytest.raises(BagError, match="MiB of joint states of changing form"):
+        twodof.read_bag(bag)
 
 
 @pytest.mark.parametrize("command", ["info", "plot"])

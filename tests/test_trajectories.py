@@ -18,6 +18,7 @@ from scipy.interpolate import BPoly
 from scipy.linalg import expm
 
 import twodof
+from twodof.bag import recorded_commands
 from twodof.cli.main import main
 from twodof.errors import InputError
 
@@ -139,6 +140,16 @@ def test_the_robot_follows_exactly_the_held_inputs(arm, tmp_path):
         state = (flow @ np.vstack([state, c]))[:2]
         q.append(state[0])
     assert np.abs(twodof.read_bag(out).q - q).max() < 1e-9
+
+
+def test_the_points_of_all_trajectories_are_limited(arm, tmp_path, monkeypatch):
+    several = [(0.1 * k, trajectory([(1.0, *THERE), (2.0, *BACK)])) for k in range(3)]
+    bag = write(tmp_path / "bag", *several)
+    monkeypatch.setattr(recorded_commands, "MAX_POINTS", 6)
+    assert twodof.read_commands(arm, bag)
+    monkeypatch.setattr(recorded_commands, "MAX_POINTS", 5)
+    with pytest.raises(InputError, match="has trajectories of more than 5 points"):
+        twodof.read_commands(arm, bag)
 
 
 def test_the_robot_stays_on_the_trajectory(arm, tmp_path):

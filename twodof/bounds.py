@@ -60,6 +60,7 @@ MAX_CELLS = 1_000_000  # all cells are stored in the bag's run.json
 MAX_COMMANDS = 1_000_000  # messages of a bag
 MAX_COMMAND = 64 * KIB  # a message; some thousand joints, read within milliseconds
 MAX_COMMANDS_SIZE = 384 * MIB  # all of these messages, and what they take in memory
+MAX_POINTS = 250_000  # of all trajectories in a bag, each of which takes 40 µs
 MAX_TRAJECTORY = 4 * MIB  # a message; some ten thousand points, read within a second
 
 # bags
@@ -74,9 +75,11 @@ MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much m
 MAX_PROVENANCES = 64 * MIB  # of all robots of a bag, which a recovery holds
 MAX_HELD = 5_000_000  # input values, summed over all changes of inputs
 MAX_JOINT_STATE = 64 * KIB  # a message; a thousand joints
+MAX_ODD = 128 * MIB  # joint states that differ in frame, byte order or padding, which takes seconds
 MAX_SAMPLES = 2048 * MIB  # joint states in memory; a day of 7 joints at 100 Hz takes 1450 MiB
 MAX_SAMPLES_RATIO = 50  # joint states in memory beyond MAX_DRAWN to the bag's size; an arm at rest reaches 12
 MAX_DRAWN = 128 * MIB  # joint states in memory from which samples to draw are chosen
+MAX_COMPARED_SIZE = 256 * MIB  # joint states of several bags in one figure; an hour of 7 joints at 100 Hz takes 60
 MAX_LOOSE = 16 * MIB  # records outside chunks that are read at a time, apart from one large record
 MAX_VALUE = 1e100  # of a sample that is judged, fitted or drawn: squares of much larger numbers overflow
 MAX_PROFILES = 64 * KIB  # different QoS profiles of all topics, in YAML, which is slow to parse

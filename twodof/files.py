@@ -5,6 +5,7 @@ import fcntl
 import io
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -26,6 +27,7 @@ METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # compression methods that
 MAX_LINKS_FOLLOWED = 40  # the kernel's limit
 TEMPORARY = ".twodof."
 """Prefix of temporary folders, whose process holds their lock or has died."""
+MADE_HERE = re.compile(r"\.twodof\.tmp\w{8}")  # names that mkdtemp makes
 FEW_BYTES = 1_000_000  # free bytes of a disk that is almost full
 LOCK_TIMEOUT = 5.0  # s of waiting for a lock
 NUMBER = int | float
@@ -221,7 +223,8 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     except FileNotFoundError as error:
         raise OSError(error.errno, f"{error.strerror}; name one in TMPDIR") from error
     for left in parent.glob(f"{TEMPORARY}*"):
-        _remove_abandoned(left)
+        if MADE_HERE.fullmatch(left.name):
+            _remove_abandoned(left)
     folder = Path(tempfile.mkdtemp(dir=parent))
     held = lock(folder)
     if is_being_written(folder):  # only now that it is locked: others remove unlocked ones

@@ -3,6 +3,7 @@
 /** @typedef {import("./samples.js").Samples} Samples */
 
 export const GAINS = [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]]; // of position or joints, and of orientation
+const SWINGING = 0.7; // damping ratio below which an error that shrinks once will grow again
 const SQUARINGS = 24; // of the loop's matrix A: the norm of A^(2^24), to the power 2^-24, is its spectral radius
 
 /** The spectral radius of q'' = −Kp q − Kd q' between the periods of a sampled controller with a delay; for Kp = 0 of q'. */
@@ -44,6 +45,13 @@ export function decay(Kp, Kd) {
 export function slowest(session, i) {
   const [Kp, Kd] = GAINS[i].map((group) => session.held(group));
   return Math.min(...Kp.map((p, n) => (p > 0 ? decay(p, Kd[n]) : Infinity)));
+}
+
+/** The rate of decay of the loops of position or joints (0), or of orientation (1), if they swing, 1/s; else infinity. */
+/** @type {(session: Samples, i: number) => number} */
+export function swing(session, i) {
+  const [Kp, Kd] = GAINS[i].map((group) => session.held(group));
+  return Math.min(...Kp.map((p, n) => (p > 0 && Kd[n] < SWINGING * 2 * Math.sqrt(p) ? Kd[n] / 2 : Infinity)));
 }
 
 /** Names and values of the gains of each loop; that of the self-motion has no stiffness, and moves only redundant arms. */

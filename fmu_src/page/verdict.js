@@ -1,14 +1,12 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
 import { BEFORE_REACH, BEFORE_TIME, FOLLOWING, MOTION, cause, forceUnit, short, speedUnit } from "./cause.js";
-import { GAINS, decay, loops, slowest, spectralRadius } from "./sampled_loop.js";
+import { GAINS, decay, loops, slowest, spectralRadius, swing } from "./sampled_loop.js";
 import { Search, off, solved, squared } from "./search.js";
 
-/** @typedef {import("./robot.js").Robot} Robot */
-/** @typedef {import("./cause.js").Cause} Cause */
+/** @typedef {import("./cause.js").Cause} Cause @typedef {import("./robot.js").Robot} Robot */
 
-const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
-const HELD = 1e-3; // m or rad: a smaller error of an output that is held, and that only falls, is no failure
+const BAND = 0.02, FLOOR = 1e-4, HELD = 1e-3; // part of the initial error, m or rad: reached; and if it is held and falls
 const PATIENCE = 5, SETTLE = 1; // s: of a run that goes on, and after a change of the target for permanent causes only
 const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the share from which on a state is a cause
 const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
@@ -80,11 +78,12 @@ export class Verdict {
   /** @type {(found: Cause[]) => Cause[]} */
   ranked(found) {
     const order = this.robot.facts.causes, driven = found.some(({ kind }) => kind === "limit") ? this.driven() : [];
+    const pushed = found.some(({ kind, share }) => kind === "load" && share > DRAG); // perhaps to a limit
     const motors = Math.max(0, ...found.filter(({ kind }) => kind === "saturation").map(({ share }) => share));
     /** @type {(cause: Cause) => boolean} */
     const passing = ({ kind, share, joint }) => kind === "limit" && (share < motors || driven[joint]);
     /** @type {(cause: Cause) => number} */
-    const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind);
+    const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind === "limit" && pushed ? "load" : each.kind) + 0.5 * Number(each.kind === "limit");
     const fades = found.some(({ kind }) => kind === "time") && this.vanishing(), [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
     /** @type {(cause: Cause) => number} */
     const first = ({ kind }) => Number((near && !BEFORE_REACH.includes(kind)) || (fades && !BEFORE_TIME.includes(kind)));
@@ -247,15 +246,16 @@ export class Verdict {
   /** Loads and the damping of joints, which the controller does not know. */
   loads() {
     const { session } = this, { values } = session, found = [], unknown = "the controller does not know the";
-    const payload = Number(values.get("payload") ?? 0), slight = SLIGHT * Math.max(...this.picked().flatMap((k) => [...session.at("tau", k)].map(Math.abs)), 0);
-    if (payload * 9.81 > slight && values.get("payload_known") !== true) found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, 1));
+    const payload = Number(values.get("payload") ?? 0), most = Math.max(...this.picked().flatMap((k) => [...session.at("tau", k)].map(Math.abs)), 1e-300);
+    if (payload * 9.81 > SLIGHT * most && values.get("payload_known") !== true)
+      found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, (payload * 9.81) / most));
     for (const group of ["tau_ext", "f_ext"])
-      if (session.held(group).some((value) => Math.abs(value) > slight))
-        found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, 0.5));
+      if (session.held(group).some((value) => Math.abs(value) > SLIGHT * most))
+        found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, Math.max(...session.held(group).map(Math.abs)) / most));
     /** @type {(own: (damping: number, i: number) => boolean) => string[]} */
     const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
     const heavy = damped((size, i) => size > 2 * this.joints[i].damping), some = damped((size) => size > 0);
-    if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 0.4));
+    if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 1));
     else if (some.length && this.drags()) found.push(cause("drag", `${unknown} damping of joints ${some.join(", ")} in the URDF`));
     return found;
   }
@@ -330,7 +330,7 @@ export class Verdict {
     const three = [late[0], late[(late.length - 1) >> 1], late[late.length - 1]].map((k) => this.errors(k));
     return this.missed().every((is, i) => {
       const [before, middle, last] = three.map((errors) => errors[i]), bend = before - 2 * middle + last;
-      return !is || (Math.log(before / last) >= SPOILT * slowest(this.session, i) * passed && !(bend > 0 && last - (last - middle) ** 2 / bend > 0.5 * last));
+      return !is || (swing(this.session, i) === Infinity && Math.log(before / last) >= SPOILT * slowest(this.session, i) * passed && !(bend > 0 && last - (last - middle) ** 2 / bend > 0.5 * last));
     });
   }
 
@@ -338,9 +338,9 @@ export class Verdict {
   /** @type {(missed: boolean[]) => Cause[]} */
   slow(missed) {
     const { session } = this, late = this.picked(0.2), end = late.length - 1, passed = session.time(late[end]) - session.time(late[0]);
-    const damped = session.held("Kd"), over = session.held("Kp").some((p, i) => damped[i] > 2 * Math.sqrt(p));
+    const over = session.held("Kp").some((p, i) => session.held("Kd")[i] > 2 * Math.sqrt(p)), most = [0, 1].map((i) => swing(session, i));
     return missed.flatMap((is, i) => {
-      const size = late.map((k) => this.errors(k)[i]), rate = Math.log(size[0] / size[end]) / passed;
+      const size = late.map((k) => this.errors(k)[i]), rate = Math.min(Math.log(size[0] / size[end]) / passed, most[i]);
       const left = Math.log(Math.max(size[end] / Math.max(BAND * this.way[i], FLOOR), 1)) / rate;
       const falls = is && end > 1 && size[end] > 0 && rate * passed > 1e-6 && size.every((value, k) => !k || value < size[k - 1]);
       const what = i ? "orientation still approaches" : session.groups.has("q_des") ? "joints still approach" : "position still approaches";

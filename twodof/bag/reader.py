@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
+from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_ODD, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
 from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
@@ -214,6 +214,7 @@ class _JointStates:
         self._path = path
         self._layout: Layout | None = None
         self._sizes: tuple[int, ...] = ()
+        self._odd = 0  # bytes that were decoded one by one
         self._stamps = array("q")
         self._numbers = [array("d") for _ in range(3)]
 
@@ -258,8 +259,15 @@ class _JointStates:
                 self._layout = joint_state_layout(self.names, frame, self._sizes)
             numbers = self._layout.unpack(messages)
             if numbers is None:
+                self._odd += messages.nbytes
+                if self._odd > MAX_ODD:
+                    raise BagError(
+                        f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form"
+                    )
                 numbers = [np.array(part, np.float64) for part in zip(*map(self._decode_one, messages), strict=True)]
             return numbers
+        except BagError:
+            raise
         except MixtureError as error:
             raise BagError(f"'{self._path}' has joint states of different {error}") from error
         except Exception as error:  # rosbags raises any exception for bytes that are not a JointState

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from itertools import chain, repeat
+from itertools import chain, count, repeat
 from math import floor, inf
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from ..bounds import MAX_COMMANDS, MAX_COMMANDS_SIZE, MIB
+from ..bounds import MAX_COMMANDS, MAX_COMMANDS_SIZE, MAX_POINTS, MIB
 from ..errors import BagError, InputError
 from ..files import shown
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import CONTROLS
 from ..ros.commands import LONGEST_NAME, Command, CommandError, Commands
-from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY
+from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY, TRUE_STATES
 from ..ros.trajectories import Trajectory, follow, read_trajectory
 from ..simulation.experiments import NANOSECONDS, default
 from ..simulation.input_values import Changes, Setting, Value, resolve
@@ -28,7 +28,7 @@ from .records import DamageError, ReadBudget
 
 LOG = logging.getLogger(__name__)
 COMMAND_SIZE = 150  # bytes that a message takes in memory in addition to its own
-SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of a robot's motion, not of commands
+SAMPLES = (JOINT_STATES, TRUE_STATES, END_EFFECTOR)  # topics of a robot's motion, not of commands
 FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs that trajectories set
 Read = TypeVar("Read", Command, Trajectory)
 Stored = list[tuple[int, str, bytes]]
@@ -152,8 +152,15 @@ def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read],
 def _followed(commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str) -> Changes:
     """Return inputs with which joints follow trajectories, at the steps at which they change."""
     joints = {name: i for i, name in enumerate(fmu.joints)}
-    read = _read(commands, begin, lambda came, _, data: read_trajectory(data, joints, came, begin), bag)
-    trajectories = [trajectory for _, trajectory in read]
+    points = count()
+
+    def read_one(came: int, _: str, data: bytes) -> Trajectory:
+        trajectory = read_trajectory(data, joints, came, begin)
+        if max(next(points) for _ in trajectory.points) >= MAX_POINTS:
+            raise InputError(f"{bag} has trajectories of more than {MAX_POINTS} points; cut it into several bags")
+        return trajectory
+
+    trajectories = [trajectory for _, trajectory in _read(commands, begin, read_one, bag)]
     begun, ended = min(it.start for it in trajectories), max(it.times[-1] for it in trajectories)
     if not ended - begun <= MAX_COMMANDS * step < inf:
         most = f"{MAX_COMMANDS} steps of {step:g} s"

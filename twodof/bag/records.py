@@ -46,7 +46,8 @@ class Batch(NamedTuple):
 
 def add_channel(file: Path, channels: dict[int, Channel], number: int, channel: Channel) -> None:
     """Add a topic of a file to those known, by number; raise DamageError for too many, or for a long name."""
-    channels[number] = channel
+    if channels.setdefault(number, channel) != channel:  # as the specification forbids
+        raise DamageError(f"'{file.name}' has two topics of the number {number}")
     if len(channels) > MAX_TOPICS:
         raise DamageError(f"'{file.name}' has more than {MAX_TOPICS} topics")
     if len(channel.topic) + len(channel.type) > MAX_NAME:

@@ -91,13 +91,23 @@ class Point:
         slopes = self.slopes(instance, name, instance.set)
         return ~slopes.smooth | slopes.differ(given)
 
+    def holds(self, instance: Instance, state: str) -> NDArray[np.bool_]:
+        """Return which unknowns keep their values exactly over a part of a step in which the state changes."""
+        trial = self._trial
+        read, reads_state = instance.reader(self.unknowns), instance.reader([state])
+        trial.begin_again(instance, self.values)
+        before, at = np.array(read()), reads_state()
+        varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
+        instance.step(trial.start, trial.step * (PART if varies else 1.0))
+        return (np.array(read()) == before) & (reads_state() != at)
+
 
 def derivatives(trial: Trial) -> str:
     """Compare directional derivatives with central differences.
 
     Inputs and states are changed before initialisation. If the initialisation takes a sample, as that of a sampled
     controller, its differences are no derivatives; inputs are then changed between two samples, after a part of a step,
-    and differences over states are no proof.
+    and differences over states are no proof. An output that keeps its value while the state changes was sampled, too.
     """
     trial.require("providesDirectionalDerivative")
     point = Point(trial)
@@ -117,6 +127,11 @@ def derivatives(trial: Trial) -> str:
                 still = point.between_samples(instance, name)
                 samples |= bool((wrong & ~still).any())
                 wrong &= still
+            elif wrong.any() and (held := wrong & point.holds(instance, name) & (given == 0.0)).any():
+                samples, wrong = True, wrong & ~held
+                doubtful = (
+                    doubtful or f"∂{point.unknowns[int(held.argmax())]}/∂{name} is not 0 at the start, and it gives 0"
+                )
             if wrong.any():
                 k = int(wrong.argmax())
                 text = f"∂{point.unknowns[k]}/∂{name} is {slopes.best[k]:.9g}, and it gives {given[k]:.9g}"

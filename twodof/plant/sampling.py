@@ -166,7 +166,7 @@ def sampling_refusal(plant: ControlledPlant, of_points: bool) -> str:
     period, delay = plant.control_period, plant.control_delay
     if delay and not period:
         return f"control_delay = {delay:g} needs a control_period > 0; set that, or leave it out"
-    if delay > MOST_PERIODS * period:
+    if delay > MOST_PERIODS * period * (1.0 + 1e-12):  # 0.11 is more than ten times 0.011 in binary numbers
         return (
             f"control_delay = {delay:g} must be at most {MOST_PERIODS} times control_period = {period:g};"
             " lessen it, or enlarge control_period"

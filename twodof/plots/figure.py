@@ -6,11 +6,12 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from itertools import chain
 from math import ceil
 from pathlib import Path
 from string import Template
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from ..errors import PlotError
 from ..files import data_file, descriptor_of, free_name, head_of, refusing, write_file
@@ -173,8 +174,13 @@ def _end(text: str, letters: int) -> str:
     return text if len(text) <= letters else f"…{text[1 - letters :]}"
 
 
+def plain_style() -> AbstractContextManager[None]:
+    """Return a context without the styles of a matplotlibrc, which may lie in the working directory and run LaTeX."""
+    return cast(AbstractContextManager[None], matplotlib.style.context(["default", STYLE]))
+
+
 def _draw(drawing: Drawing, figure: Figure) -> Figure:
-    with matplotlib.style.context(["default", STYLE]):
+    with plain_style():
         drawing.draw(figure)
     for axes in figure.axes:
         if axes.get_label() != "<colorbar>":
@@ -190,7 +196,7 @@ def _rendered(figure: Figure, kind: str) -> bytes:
         "pdf": {"Creator": f"twodof {__version__}", "CreationDate": None},
     }
     content = io.BytesIO()
-    with matplotlib.style.context(["default", STYLE]):
+    with plain_style():
         figure.savefig(content, format=kind, metadata=metadata[kind])
     return content.getvalue()
 

@@ -17,7 +17,7 @@ from ..errors import PlotError
 from ..export.closed_form import Array
 from ..files import refusing, temporary_folder, write_file
 from ..version import needing
-from .figure import Drawing, draw_head, drawn
+from .figure import Drawing, draw_head, drawn, plain_style
 from .panels import title
 from .runs import draw_view
 from .settings import number
@@ -60,16 +60,17 @@ def film(
     if track.motion is None:
         raise PlotError(f"'{track.recording.path}' contains no robot; give one with `urdf`")
     kind, end, content = path.suffix.lower(), float(track.t[-1]), io.BytesIO()
-    if kind == ".png":
-        shape = (round(SIZE[1] * DOTS), round(SIZE[0] * DOTS), 4)
-        for picture in _frames(track, np.array([end])):
-            imsave(content, np.frombuffer(picture, np.uint8).reshape(shape), format="png")
-    else:
-        fps, codec = FILMS[kind]
-        if end * fps > MAX_FRAMES:
-            raise PlotError(f"'{track.recording.path}' has {end:g} s; a film has at most {MAX_FRAMES / fps:g} s")
-        times = np.arange(round(end * fps) + 1) / fps
-        content.write(_encoded(_frames(track, times), path, ["-r", str(fps), "-i", "-", "-vcodec", *codec.split()]))
+    with plain_style():
+        if kind == ".png":
+            shape = (round(SIZE[1] * DOTS), round(SIZE[0] * DOTS), 4)
+            for picture in _frames(track, np.array([end])):
+                imsave(content, np.frombuffer(picture, np.uint8).reshape(shape), format="png")
+        else:
+            fps, codec = FILMS[kind]
+            if end * fps > MAX_FRAMES:
+                raise PlotError(f"'{track.recording.path}' has {end:g} s; a film has at most {MAX_FRAMES / fps:g} s")
+            times, options = np.arange(round(end * fps) + 1) / fps, ["-r", str(fps), "-i", "-", "-vcodec"]
+            content.write(_encoded(_frames(track, times), path, [*options, *codec.split()]))
     with refusing(PlotError, f"write '{path}'"):
         write_file(path, content.getvalue())
 

@@ -2,7 +2,7 @@
 
 import { plotlyContent } from "../../fmu_src/page/unpack.js";
 
-/** @typedef {{varied: string[], metrics: Record<string, string>, units: Record<string, string>, columns: Record<string, (number | null)[]>, outcome: string[], beyond: boolean[], best: number[], fmu: string, settings: string[], curves: Record<string, {verdict: string, lines: Record<string, [number[], number[]]>}>}} Sweep */
+/** @typedef {{varied: string[], metrics: Record<string, string>, units: Record<string, string>, columns: Record<string, (number | null)[]>, outcome: string[], beyond: boolean[], best: number[], again: string[], quoted: Record<string, string>, curves: Record<string, {verdict: string, lines: Record<string, [number[], number[]]>}>}} Sweep */
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -104,15 +104,15 @@ class SweepPage {
 
   /** Show the selected run: its numbers, the command that repeats it, and its curves, if it has a bag. */
   describe() {
-    const { columns, outcome, beyond, varied, metrics, curves, fmu, settings } = this.sweep, k = this.chosen, run = this.runs[k];
+    const { columns, outcome, beyond, varied, metrics, curves, again, quoted } = this.sweep, k = this.chosen, run = this.runs[k];
     const number = (/** @type {string} */ name) => Number(columns[name][k]).toPrecision(4);
     const known = Object.keys(metrics).filter((name) => columns[name][k] !== null);
     const lines = [
       `run ${run}: ${varied.map((name) => `${name} = ${number(name)}`).join(", ")}; ${outcome[k]}${beyond[k] ? "; not possible on this robot: beyond the URDF's limits" : ""}`,
       known.map((name) => `${this.title(name)}: ${number(name)}`).join("; "), curves[run]?.verdict ?? "",
     ];
-    const again = `twodof run ${fmu} ${[...settings, ...varied.map((name) => `--set '${name}=${columns[name][k]}'`)].join(" ")}`;
-    const code = Object.assign(document.createElement("code"), { textContent: again });
+    const command = [...again, ...varied.map((name) => `--set ${quoted[name]}=${columns[name][k]}`)].join(" ");
+    const code = Object.assign(document.createElement("code"), { textContent: command });
     this.detail.replaceChildren(...lines.filter(Boolean).map((text) => Object.assign(document.createElement("p"), { textContent: text })), code, this.curve);
     const drawn = Object.entries(curves[run]?.lines ?? {});
     this.curve.hidden = !drawn.length;

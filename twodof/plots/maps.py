@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST_RUNS = 20_000  # runs on a page; of a larger sweep, an evenly spaced selection
 MOST_CURVES, POINTS = 2000, 200
+MOST_NUMBERS = 2_000_000  # of all curves
 """Number of runs whose curves a page contains, and of points in each curve."""
 
 
@@ -51,9 +53,10 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
         "outcome": rows["outcome"].tolist(),
         "beyond": beyond_limits(rows).tolist(),
         "best": [int(run) for run in best],
-        "fmu": table.attrs["provenance"]["fmu"]["file"],
-        "settings": [f"--stop-time {options['stop_time']:g}", f"--step {options['step']:g}"]
-        + [f"--set '{name}={str(value).lower()}'" for name, value in options["settings"].items()],
+        "again": [f"twodof run {quote(table.attrs['provenance']['fmu']['file'])}"]
+        + [f"--stop-time {options['stop_time']:g}", f"--step {options['step']:g}"]
+        + [f"--set {quote(f'{name}={str(value).lower()}')}" for name, value in options["settings"].items()],
+        "quoted": {name: quote(name) for name in varied},
         "curves": _curves(rows, bags),
     }
     return f'<div id="maps"></div>\n{figures_html(content, "maps.js")}'
@@ -68,7 +71,10 @@ def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, ob
     curves: dict[str, dict[str, object]] = {}
     if bags is None or not bags.is_dir():
         return curves
+    room = MOST_NUMBERS
     for run in rows["run"].tolist()[:MOST_CURVES]:
+        if room < 0:  # the other runs have no curves
+            break
         try:
             bag = read_bag(bags / f"{run:06d}")
             lines = {name: bag.q[:, i] for i, name in enumerate(bag.joints)}
@@ -78,6 +84,7 @@ def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, ob
         except BagError:
             continue
         drawn = {name: downsampled(values, POINTS) for name, values in lines.items()}
+        room -= bag.q.size // POINTS + sum(map(len, drawn.values()))
         curves[str(run)] = {
             "verdict": verdict,
             "lines": {name: [_numbers(bag.t[k]), _numbers(lines[name][k])] for name, k in drawn.items()},

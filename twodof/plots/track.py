@@ -10,7 +10,7 @@ import numpy as np
 from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_downsampled
 from ..bag.recording import Recording, Verdict
-from ..bounds import MAX_VALUE
+from ..bounds import MAX_COMPARED_SIZE, MAX_VALUE, MIB
 from ..errors import BuildError, PlotError
 from ..export.closed_form import Array, Held, task_error
 from ..export.urdf_source import read_text
@@ -51,7 +51,10 @@ class JointTrack:
     @property
     def stuck(self) -> Array:
         """Positions at samples at which friction holds the joint, NaN at other samples, N values."""
-        rests = np.pad((self.v == 0.0) & self.has_friction, 1) if self.v.size else np.zeros(len(self.q) + 2, bool)
+        stops = [limit for limit in (self.low, self.high) if limit is not None]
+        free = np.all([np.abs(self.q - limit) > AT_LIMIT * max(1.0, abs(limit)) for limit in stops], axis=0)
+        held = (self.v == 0.0) & self.has_friction & free if self.v.size else np.zeros(len(self.q), bool)
+        rests = np.pad(held, 1)
         return np.where(rests[1:-1] & (rests[:-2] | rests[2:]), self.q, np.nan)
 
     @property
@@ -157,7 +160,15 @@ def read_tracks(
     track = partial(_track, urdf=text, source=str(urdf), frame=frame)
     if len(bags) == 1 and not isinstance(bags[0], Recording):
         return [track(read_downsampled(bags[0], most, lambda part: _lines(track(part))))]
-    return [track(bag if isinstance(bag, Recording) else read_bag(bag)) for bag in bags]
+    recordings, size = list[Recording](), 0
+    for bag in bags:
+        recordings.append(bag if isinstance(bag, Recording) else read_bag(bag))
+        size += 0 if isinstance(bag, Recording) else 3 * recordings[-1].q.nbytes
+        if size > MAX_COMPARED_SIZE:
+            raise PlotError(
+                f"the bags have more than {MAX_COMPARED_SIZE // MIB} MiB of joint states; plot fewer of them"
+            )
+    return [track(recording) for recording in recordings]
 
 
 def _lines(track: Track) -> list[Array]:
@@ -288,6 +299,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
     external = [name for name in first if name.startswith(("tau_ext[", "f_ext["))]
     astray = bool(off.max() > NOTABLE)
     at_work = {
+        "sampling": bool(first.get("control_period")),
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
         "singularities": astray and linkage.is_singular(q, float(first.get("rcond", 0.0)), turns),

@@ -19,6 +19,7 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
+GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
 BEFORE_TIME = ("diverged", "degrees", "time")  # kinds that precede others if the errors vanish as the gains let them
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
 BEFORE_REACH = ("diverged", "degrees", "gain", "feedforward", "unstable", "load", "friction")
@@ -55,9 +56,13 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
 
     near = any(cause.point and _excess(judge, cause) > cause.share for cause in found)
 
-    def rank(cause: Cause) -> tuple[bool, int, float]:
-        late = (near and cause.kind not in BEFORE_REACH) or (fades and cause.kind not in BEFORE_TIME)
-        return late, order.index("drag" if passing(cause) else cause.kind), -cause.share
+    pushed = any(cause.kind == "load" and cause.share > DRAG for cause in found)  # perhaps to a limit
+
+    def rank(cause: Cause) -> tuple[bool, int, bool, float]:
+        grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
+        late = (near and cause.kind not in BEFORE_REACH) or (fades and not grows and cause.kind not in BEFORE_TIME)
+        kind = "drag" if passing(cause) else "load" if pushed and cause.kind == "limit" else cause.kind
+        return late, order.index(kind), cause.kind == "limit", -cause.share
 
     if not found:
         return ()

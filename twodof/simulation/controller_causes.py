@@ -1,7 +1,7 @@
 """Causes of a run's failure in the controller: its gains, its sampling, and what it does not know."""
 
 from collections.abc import Iterator, Sequence
-from math import log, sqrt
+from math import inf, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 SLIGHT = 1e-4  # torque, relative to the largest effort, below which a load does not count
 LEVER = 1.0  # m: of a force at the end effector
 PERIODS = ("control_period", "control_delay")
+SWINGING = 0.7  # damping ratio below which an error that shrinks once will grow again
 FADING = 0.7  # ratio of mean speeds, of the second to the first half of the last samples, that shows a decay
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 GAINS = (("Kp", "Kd"), ("Kp_rot", "Kd_rot"))
@@ -65,7 +66,7 @@ def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         still = not judge.given(group).any() and f"{group}[1]" not in judge.inputs
         if of in missed and judge.changes > MANY_CHANGES and still and lags:
             text = f"the target moves, and {group} is 0: the lag is {damp}/{stiff} = {max(lags):.3g} s"
-            yield Cause("feedforward", f"{text}; set {group}, raise {stiff} or lower {damp}", 0.5)
+            yield Cause("time", f"{text}; set {group}, raise {stiff} or lower {damp}", 0.5)
 
 
 def load(judge: Judge) -> Iterator[Cause]:
@@ -73,30 +74,33 @@ def load(judge: Judge) -> Iterator[Cause]:
     payload, switch = judge.held.get("payload"), "payload_known"
     own = next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
     payload, believed = payload or 0.0, judge.held.get(f"{own}payload", 0.0) if judge.held.get(switch) else 0.0
-    if payload and believed != payload and _matters(judge, payload * GRAVITY * LEVER):
+    if payload and believed != payload and (share := _share(judge, payload * GRAVITY * LEVER)) > SLIGHT:
         remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
-        yield Cause("load", f"the controller does not know the payload of {payload:g} kg; {remedy}", 1.0)
-    elif believed != payload:
+        yield Cause("load", f"the controller does not know the payload of {payload:g} kg; {remedy}", share)
+    elif believed and not payload:
         text = f"the controller knows a payload of {believed:g} kg, which the plant does not have; set {own}payload=0"
-        yield Cause("load", text, 1.0)
+        yield Cause("load", text, _share(judge, believed * GRAVITY * LEVER))
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
-    given = zip(usual, judge.given("damping"), judge.speed)
-    heavy = [name for name, d, speed in given if d > 2.0 * usual[name] and _matters(judge, d * speed)]
+    drags = [_share(judge, d * speed) for d, speed in zip(judge.given("damping"), judge.speed)]
+    given = zip(usual, judge.given("damping"), drags)
+    heavy = [name for name, d, share in given if d > 2.0 * usual[name] and share > SLIGHT]
     each = heavy or [name for name in usual if usual[name] > 0.0]
     names = "of any joint" if len(each) == len(usual) > 2 else f"of joints {', '.join(map(repr, each))}"
-    kind, tail, share = ("load", "", 0.4) if heavy else ("drag", " in the URDF", 0.0)
+    kind, tail, share = ("load", "", max(drags)) if heavy else ("drag", " in the URDF", 0.0)
     if each and (heavy or _drags(judge)):
         yield Cause(kind, f"the controller does not know the damping {names}{tail}", share)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
-        if values.any() and _matters(judge, np.abs(values).max() * (LEVER if group == "f_ext" else 1.0)):
-            yield Cause("load", f"the controller does not know {group} = {point_text(values)}{unit}", 0.5)
+        share = _share(judge, np.abs(values).max(initial=0.0) * (LEVER if group == "f_ext" else 1.0))
+        if share > SLIGHT:
+            yield Cause("load", f"the controller does not know {group} = {point_text(values)}{unit}", share)
 
 
-def _matters(judge: Judge, torque: float) -> bool:
-    """Return whether a torque, N·m, is not negligible beside the largest effort."""
-    return torque > SLIGHT * judge.effort.max(initial=0.0)
+def _share(judge: Judge, torque: float) -> float:
+    """Return the ratio of a torque, N·m, to the largest effort; 1 without efforts."""
+    most = float(judge.effort.max(initial=0.0))
+    return torque / most if most else float(torque > 0.0)
 
 
 def _drags(judge: Judge) -> bool:
@@ -253,13 +257,16 @@ def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     """Yield a cause for each output whose error still shrinks, with the remaining time by its rate."""
     for name in missed:
         rate, aim = _rate(judge, name), judge.aims[name]
+        stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
+        pairs = [(p, d) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
+        ratios = [d / (2.0 * sqrt(p)) for p, d in pairs]
+        if min(ratios, default=1.0) < SWINGING:  # an error passes 0 and grows again
+            rate = min(rate, *(0.5 * d for _, d in pairs))
         left = log(max(aim.last / max(BAND * aim.first, FLOOR), 1.0)) / rate if rate else 0.0
         what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
         if rate and left < 1000.0 * judge.duration:
             late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
             text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
-            stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
-            ratios = [d / (2.0 * sqrt(p)) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
             remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > 1.0 else "raise the gains"
             yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; {remedy}, or stop later", left)
 
@@ -274,12 +281,10 @@ def vanishing(judge: Judge, missed: Sequence[str]) -> bool:
         before, middle, last = size[:: max(1, (len(size) - 1) // 2)][:3] if len(size) > 2 else (0.0, 0.0, 1.0)
         bend = before - 2.0 * middle + last
         group = "Kp_rot" if name == "quat" else "Kp"
-        rates = [_decay(loop) for loop in _loops(judge, 1.0, 0.0) if loop.stiff == group and loop.Kp > 0.0]
-        if (
-            not rates
-            or _rate(judge, name) < SPOILT * min(rates)
-            or (bend > 0.0 and last - (last - middle) ** 2 / bend > 0.5 * last)
-        ):
+        loops = [loop for loop in _loops(judge, 1.0, 0.0) if loop.stiff == group and loop.Kp > 0.0]
+        swings = any(loop.Kd < SWINGING * 2.0 * sqrt(loop.Kp) for loop in loops)
+        slower = _rate(judge, name) < SPOILT * min(map(_decay, loops), default=inf)
+        if swings or slower or (bend > 0.0 and last - (last - middle) ** 2 / bend > 0.5 * last):
             return False
     return bool(missed)
 
