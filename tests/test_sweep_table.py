@@ -248,6 +248,52 @@ def test_hostile_table_gets_one_line_in_little_memory(sound, tmp_path, make):
     assert READING.max_memory() < 64 * 1024**2
 
 
+def zigzag(number: int) -> bytes:
+    """An integer of Thrift's compact protocol."""
+    number, parts = 2 * number, []
+    while number > 127:
+        parts.append(number & 127 | 128)
+        number >>= 7
+    return bytes([*parts, number])
+
+
+def test_a_page_that_is_larger_than_stated_is_not_read(sound, tmp_path):
+    """The text of 200 MB takes 6 kB; the sizes at the end of the file state 100 bytes."""
+    table, file = pq.read_table(sound).slice(0, 1), tmp_path / "runs.parquet"
+    k = table.column_names.index("message")
+    table = table.set_column(k, table.field(k), pa.array(["a" * 200_000_000]))
+    pq.write_table(table, file, compression="zstd", use_dictionary=False, write_statistics=False)
+    group = pq.ParquetFile(file).metadata.row_group(0)
+    content = file.read_bytes()
+    length = int.from_bytes(content[-8:-4], "little")
+    body, foot = content[: -8 - length], content[-8 - length :]
+    for size in {group.column(k).total_uncompressed_size, group.total_byte_size}:
+        known = zigzag(size)
+        assert known in foot
+        small = bytearray(zigzag(100))
+        while len(small) < len(known):
+            small[-1] |= 128
+            small.append(0)
+        foot = foot.replace(known, small)
+    file.write_bytes(body + foot)
+    code = """
+import resource, sys
+import pyarrow as pa
+from twodof.errors import SweepError
+from twodof.sweeps import results
+results.MAX_SWEEP = 10_000_000
+before = resource.getrlimit(resource.RLIMIT_AS)
+try:
+    results.read_sweep(sys.argv[1])
+except SweepError as error:
+    print(str(error).endswith("it is damaged"), pa.default_memory_pool().max_memory() < 100_000_000)
+print(resource.getrlimit(resource.RLIMIT_AS) == before)
+"""
+    own = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}  # an allocator of its own may have 1 GiB in reserve
+    done = python("-c", code, str(tmp_path), check=True, env=own)
+    assert done.stdout.split() == ["True"] * 3
+
+
 @pytest.mark.long
 def test_memory_of_the_coordinator_is_flat(native_path, tmp_path, length):
     """It is measured after pyarrow has written its first rows, for which it takes some 15 MiB."""

@@ -12,8 +12,8 @@ import resource
 import socket
 import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -217,6 +217,23 @@ def limit(memory: int, others: Mapping[int, int] | None = None) -> None:
         hard = resource.getrlimit(kind)[1]
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
+
+
+@contextmanager
+def memory_for(size: int) -> Iterator[None]:
+    """Limit the address space of this process for a while, on Linux, to its present size and some bytes.
+
+    Larger allocations then fail, in all threads.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if sys.platform == "linux":
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        known = [most for most in (soft, hard) if most != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(used + size, *known), hard) if known else (used + size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def limit_time(seconds: float) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bounds import MAX_NUMBER, MAX_PROVENANCE, MAX_RUNS, MAX_SETTINGS, MAX_SWEEP, MAX_VARIED
+from ..children import memory_for
 from ..errors import SweepError, no_such
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
@@ -245,12 +246,15 @@ def _read(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
             runs = _check_schema(file, schema)
             with pq.ParquetFile(file, read_dictionary=TEXTS) as stored:
                 _check_size(file, stored.metadata, runs, room)
-                table = stored.read()
+                with memory_for(3 * MAX_SWEEP):  # a page may have more than the file states
+                    table = stored.read(use_threads=False)
             room -= table.nbytes + sum(_expanded(table.column(name)) for name in TEXTS)
             if room < 0:
                 raise _damaged(file)
             _check_values(file, table, runs)
             yield file, table.cast(schema)
+        except MemoryError:
+            raise _damaged(file) from None
         except (OSError, pa.ArrowException) as error:
             reason = " ".join(str(error).split())
             raise SweepError(f"cannot read '{file}': {reason:.300}") from error
