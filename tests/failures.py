@@ -247,6 +247,20 @@ FAILURES = {
         "Kd[1] (of joint 'joint1') = 45 s⁻¹ are too high",
         1.0,
     ),
+    "too little damping, and a load that does not matter": Failure(
+        "arm", "task", {"Kd": 1.0, "f_ext": (0.0, 0.0, 5.0)}, ("damping", "load"), "Kd = 1 s⁻¹ damps", 2.0
+    ),
+    "too little damping, and a small payload": Failure(
+        "arm", "task", {"Kd": 1.0, "payload": 0.003}, ("damping", "load"), "Kd = 1 s⁻¹ damps", 2.0
+    ),
+    "too little damping, and friction": Failure(
+        "ur5",
+        "task",
+        {"q_start": (0.0, -1.0, 1.5, -0.5, 1.5, 0.0), "x_des": (0.45, 0.25, 0.4), "friction": 0.05, "Kd": 1.0},
+        ("damping",),
+        "Kd = 1 s⁻¹ damps",
+        3.0,
+    ),
     "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
     "degrees and a saturated motor": Failure(
         "ur5",

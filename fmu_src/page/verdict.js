@@ -1,7 +1,7 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
-import { BEFORE_REACH, BEFORE_TIME, FOLLOWING, MOTION, cause, forceUnit, short, speedUnit } from "./cause.js";
-import { GAINS, decay, loops, slowest, spectralRadius, swing } from "./sampled_loop.js";
+import { BEFORE_REACH, BEFORE_TIME, FOLLOWING, MOTION, STEADY, cause, forceUnit, short, speedUnit } from "./cause.js";
+import { GAINS, decay, loops, slowest, spectralRadius, swing, swings } from "./sampled_loop.js";
 import { Search, off, solved, squared } from "./search.js";
 
 /** @typedef {import("./cause.js").Cause} Cause @typedef {import("./robot.js").Robot} Robot */
@@ -84,9 +84,9 @@ export class Verdict {
     const passing = ({ kind, share, joint }) => kind === "limit" && (share < motors || driven[joint]);
     /** @type {(cause: Cause) => number} */
     const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind === "limit" && pushed ? "load" : each.kind) + 0.5 * Number(each.kind === "limit");
-    const fades = found.some(({ kind }) => kind === "time") && this.vanishing(), [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
+    const swinging = found.some(({ kind }) => kind === "damping") && swings(this.session, this.picked(0.5)), fades = found.some(({ kind }) => kind === "time") && this.vanishing(), [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
     /** @type {(cause: Cause) => number} */
-    const first = ({ kind }) => Number((near && !BEFORE_REACH.includes(kind)) || (fades && !BEFORE_TIME.includes(kind)));
+    const first = ({ kind }) => Number((near && !BEFORE_REACH.includes(kind)) || (fades && !BEFORE_TIME.includes(kind)) || (swinging && STEADY.includes(kind)));
     const [root, ...others] = found.sort((a, b) => first(a) - first(b) || rank(a) - rank(b) || b.share - a.share);
     const leads = ["degrees", "unstable", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
     if (root) root.noted = MOTION.includes(root.kind) && this.missed().includes(true); // a peak makes no error

@@ -98,7 +98,8 @@ def _known(key: bytes) -> Path | None:
 
 
 def _has(path: Path, content: bytes) -> bool:
-    return path.is_file() and descriptor_of(path) is None and path.read_bytes() == content
+    there = path.is_file() and descriptor_of(path) is None and path.stat().st_size == len(content)
+    return there and path.read_bytes() == content
 
 
 def _contents(archive: zipfile.ZipFile) -> dict[str, bytes]:

@@ -20,6 +20,8 @@ MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
 GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
+SHIFTED = 0.3  # ratio of the extremes of an error to both sides, below which it is shifted
+STEADY = ("feedforward", "friction", "load")  # kinds that shift the error about which a motion swings
 BEFORE_TIME = ("diverged", "degrees", "time")  # kinds that precede others if the errors vanish as the gains let them
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
 BEFORE_REACH = ("diverged", "degrees", "gain", "feedforward", "unstable", "load", "friction")
@@ -56,11 +58,13 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
 
     near = any(cause.point and _excess(judge, cause) > cause.share for cause in found)
 
+    swings = any(cause.kind == "damping" for cause in found) and all(_swings(judge, name) for name in missed)
     pushed = any(cause.kind == "load" and cause.share > DRAG for cause in found)  # perhaps to a limit
 
     def rank(cause: Cause) -> tuple[bool, int, bool, float]:
         grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
         late = (near and cause.kind not in BEFORE_REACH) or (fades and not grows and cause.kind not in BEFORE_TIME)
+        late |= swings and cause.kind in STEADY
         kind = "drag" if passing(cause) else "load" if pushed and cause.kind == "limit" else cause.kind
         return late, order.index(kind), cause.kind == "limit", -cause.share
 
@@ -87,6 +91,17 @@ def _excess(judge: Judge, reach: Cause) -> float:
     """Return by how much the error at the end exceeds the distance, or the angle, by which a target is out of reach."""
     gap = np.linalg.norm(judge.wanted("x") - np.array(reach.point)[judge.setup.rows])
     return judge.aims["x" if np.isclose(gap, reach.share) else "quat"].last - reach.share
+
+
+def _swings(judge: Judge, name: str) -> bool:
+    """Return whether an error passes zero to and fro in the second half of the move, hardly shifted to one side."""
+    half = judge.history() >= 0.5 * (judge.changed + judge.duration)
+    size = judge.error_history(name)[half]
+    if name == "quat" or not len(size):  # an angle has no sign
+        return len(size) > 0 and bool(size.min() < SHIFTED * size.max())
+    e = judge.wanted(name) - judge.history(name)[half]
+    along = e @ e[int(size.argmax())]
+    return bool(along.min() < -SHIFTED * along.max())
 
 
 def _degrees(judge: Judge) -> Iterator[Cause]:
