@@ -1,6 +1,7 @@
 /** A cause of a run's failure in words, and kinds of causes as in twodof/simulation/causes.py. */
 
-export const MOTION = ["effort", "velocity"], FOLLOWING = ["limit", "saturation", "singularity"];
+export const MOTION = ["effort", "velocity"];
+export const FOLLOWING = ["limit", "saturation", "singularity"];
 export const STEADY = ["feedforward", "friction", "load"]; // that shift the error about which a motion swings
 export const BEFORE_TIME = ["degrees", "time"];
 export const BEFORE_REACH = ["degrees", "gain", "feedforward", "unstable", "load", "friction"];
@@ -23,4 +24,6 @@ export function short(value) {
 }
 
 /** @type {(joint: {prismatic: boolean}) => string} */
-export const forceUnit = ({ prismatic }) => (prismatic ? "N" : "N·m"), speedUnit = ({ prismatic }) => (prismatic ? "m/s" : "rad/s");
+export const forceUnit = ({ prismatic }) => (prismatic ? "N" : "N·m");
+/** @type {(joint: {prismatic: boolean}) => string} */
+export const speedUnit = ({ prismatic }) => (prismatic ? "m/s" : "rad/s");
