@@ -46,6 +46,7 @@ import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError, PageError
 from twodof.fmu import instantiate
+from twodof.plots.scripts import EXPORT, IMPORT
 from twodof.plots.track import read_tracks
 from twodof.simulation.input_values import resolve
 
@@ -640,6 +641,13 @@ def test_the_documentation_of_an_fmu_fits_a_phone(browser, native_path, tmp_path
 
 def test_equal_fmus_make_equal_pages(native_path, arm, tmp_path) -> None:
     assert twodof.page(native_path, tmp_path / "again.html").read_bytes() == arm.read_bytes()
+
+
+@pytest.mark.parametrize("module", sorted((ROOT / "fmu_src/page").glob("*.js")), ids=lambda module: module.stem)
+def test_a_module_of_the_page_exports_what_others_import(module) -> None:
+    """The bundler reads the first name of an export only; a missing name would show when it is called."""
+    for names, path in IMPORT.findall(module.read_text()):
+        assert {*names.split(", ")} <= {*EXPORT.findall((module.parent / path).read_text())}
 
 
 def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:
