@@ -135,7 +135,7 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
 
 def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) -> tuple[dict[str, int], str]:
     """Write readable messages into a new bag; return their number by topic, and why reading ended early."""
-    damage = []
+    damage: list[str] = []
     budget = ReadBudget()
     robots = provenance.robots_of(folder)
     others = set()

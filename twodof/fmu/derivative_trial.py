@@ -99,7 +99,7 @@ class Point:
         before, at = np.array(read()), reads_state()
         varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
         instance.step(trial.start, trial.step * (PART if varies else 1.0))
-        return (np.array(read()) == before) & (reads_state() != at)
+        return np.asarray((np.array(read()) == before) & (reads_state() != at))
 
 
 def derivatives(trial: Trial) -> str:

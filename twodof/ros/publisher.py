@@ -102,8 +102,9 @@ class Publisher(Sink):
         """
         self._run, self._follows = run, Commands(run.fmu)
         run.commanders.clear()  # from an earlier run
-        of_what = {"scene": self._scene, "effort": self._effort, "clock": self._clock, "measured": has_sensors(run)}
-        self._messages = Messages(run, **of_what)
+        self._messages = Messages(
+            run, scene=self._scene, effort=self._effort, clock=self._clock, measured=has_sensors(run)
+        )
         self.topics = tuple(map(self._named, self._messages.topics))
         of_joints = self._follows.type == JOINT_STATE
         self._watchdog: Watchdog | None = None
