@@ -198,6 +198,34 @@ def test_a_summary_with_another_name_of_a_topic_is_refused(tmp_path):
         read_ends(file.parent)
 
 
+def test_messages_that_the_summary_alone_has_are_missed(tmp_path):
+    """Its checksum is valid, and it has the topic under another name and number than the only chunk."""
+    file = tmp_path / "bag" / "bag.mcap"
+    file.parent.mkdir()
+    (file.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(JOINT_STATE, "ros2msg", b"")
+        number = writer.register_channel("/joint_states", "cdr", schema)
+        writer.add_message(number, 1, serialised(joint_message(0, "j", [0.0])), 1)
+        writer.finish()
+    content = bytearray(file.read_bytes())
+    start, _ = statistics_of(content)
+    place = start
+    while place < len(content) - 37:  # the footer and the magic
+        opcode, length = struct.unpack_from("<BQ", content, place)
+        number_at = {4: 0, 8: 36, 11: 46}.get(opcode)  # in a channel, a chunk's index and the statistics
+        if number_at is not None:
+            struct.pack_into("<H", content, place + 9 + number_at, 2)
+        place += 9 + length
+    content[start:] = content[start:].replace(b"/joint_states", b"/joint_statex")
+    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
+    file.write_bytes(content)
+    with pytest.raises(twodof.TwoDofError, match="no messages on /joint_statex, which its summary counts"):
+        read_ends(file.parent)
+
+
 @pytest.mark.parametrize("name", ["/joint_states", "/other"])
 def test_ends_of_another_writer_in_any_order(tmp_path, name):
     """Small chunks have overlapping stamps; some have another topic too."""

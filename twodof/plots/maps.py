@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import pandas
 
 MOST_RUNS = 20_000  # runs on a page; of a larger sweep, an evenly spaced selection
+MOST_NUMBERS = 2_000_000  # of all curves of a page; later runs have no curves
 MOST_CURVES, POINTS = 2000, 200
-MOST_NUMBERS = 2_000_000  # of all curves
 """Number of runs whose curves a page contains, and of points in each curve."""
 
 

@@ -57,7 +57,6 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         return cause.kind == "limit" and (cause.share < motors or cause.joint in driven)
 
     near = any(cause.point and _excess(judge, cause) > cause.share for cause in found)
-
     swings = any(cause.kind == "damping" for cause in found) and all(_swings(judge, name) for name in missed)
     pushed = any(cause.kind == "load" and cause.share > DRAG for cause in found)  # perhaps to a limit
 
