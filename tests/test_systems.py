@@ -587,7 +587,7 @@ def test_invalid_systems_are_refused_at_once(
     begun = time.process_time()
     with pytest.raises(FmuError, match=re.compile(message)):
         twodof.load_fmu(system)
-    assert time.process_time() - begun < 5.0
+    assert time.process_time() - begun < 10.0  # the budget of docs/guarantees.md; the slowest needs 1.5 s
     assert [*tmp_path.iterdir()] == [system]
 
 

@@ -138,7 +138,7 @@ class Wiring:
         Raises:
             FmuError: connections form a loop without a component, or connect different types or units.
         """
-        found, room = [], MAX_WIRING
+        ways, room = [], MAX_WIRING
         for target in self._incoming:
             if target.element not in self._fmus:
                 continue
@@ -151,8 +151,8 @@ class Wiring:
                 if way[-1].element in self._fmus:
                     break
             room = _spent(self._path, room, len(way))
-            found.append(Link(way[-1], target, self._map(way[::-1])))
-        return found
+            ways.append(way)
+        return [Link(way[-1], way[0], self._map(way[::-1])) for way in ways]
 
     def _map(self, way: list[Node]) -> Affine:
         """Return the map of values along a path of connections, with conversions of units."""
