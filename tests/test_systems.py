@@ -309,6 +309,23 @@ def test_an_output_may_go_to_several_inputs_and_to_a_part_of_an_array(pd: bytes,
     np.testing.assert_array_equal([sample.q for sample in run], expected)
 
 
+@pytest.mark.parametrize("first", [1, 2])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_elements_of_an_array_may_come_at_different_depths_of_feedthrough(
+    pd: bytes, tmp_path: Path, fmi: int, first: int
+) -> None:
+    """One element is a velocity, the other the output of a controller that depends on it."""
+    options = twodof.FmuOptions(native=True, fmi=fmi, control="effort")
+    plant = twodof.build_fmu(tmp_path / "plant.fmu", options).read_bytes()
+    wires = WIRES.replace(connection(f"pd.tau[{first}]", f"plant.tau_cmd[{first}]"), "")
+    wires += connection("plant.v[1]", f"plant.tau_cmd[{first}]", more='suppressUnitConversion="true"')
+    system = loop(tmp_path / "loop.ssp", plant, pd, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
+    efforts = (lambda q, v: np.array([v[0], law(q, v)[1]]), lambda q, v: np.array([law(q, v)[0], v[0]]))
+    expected = by_hand(plant, tmp_path / "plant.fmu", efforts[first - 1])
+    run = twodof.samples(system, step=H, stop_time=N * H, settings={**GAINS, "pd.q_des": TARGET})
+    np.testing.assert_array_equal([sample.q for sample in run], expected)
+
+
 def test_an_input_that_changes_acts_from_that_instant(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     targets = [TARGET if k < 20 else -TARGET for k in range(N + 1)]
     system = loop(tmp_path / "loop.ssp", plant, pd)

@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
 from itertools import accumulate, chain
 from math import inf
@@ -80,7 +81,7 @@ class Instance:
             vector = starts.setdefault((v.type, v.reference), [])
             if v.element == len(vector):  # an alias has the reference of another vector
                 vector.append(v.start_value or 0.0)
-        self._starts, self._vectors = starts, dict(starts)  # start and latest values by type and value reference
+        self._starts, self._vectors = starts, deepcopy(starts)  # start and latest values by type and value reference
         identifier = fmu.description.coSimulation.modelIdentifier
         try:
             self.slave = self._instantiate(
@@ -135,7 +136,7 @@ class Instance:
         """Reset to the state after instantiation."""
         self._accept(self.slave.reset)
         self._running = False
-        self._vectors = dict(self._starts)
+        self._vectors = deepcopy(self._starts)
 
     def set(self, values: Mapping[str, float | bool]) -> None:
         """Set variables by name; other elements of a vector keep their last values."""
@@ -212,10 +213,12 @@ class Instance:
             if (status := put(*arguments)) > WARNING:
                 self._refuse(status)
 
+        scalars = [self.fmu.variables[name] for name in names]
+
         def write_elements() -> None:
+            for scalar, value in zip(scalars, values):
+                self._vectors["Real", scalar.reference][scalar.element] = value
             whole[:] = [*chain(*(self._vectors["Real", reference] for reference in distinct))]
-            for column, value in zip(columns, values):
-                whole[column] = value
             write()
 
         return write if whole is values else write_elements
