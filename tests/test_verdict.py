@@ -107,7 +107,6 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
     ("settings", "line"),
     [
         ({"x_des": (0.5, 0.1)}, "note: the arm is near a singularity"),
-        ({"x_des": (0.5, 0.1), "Kd": 1.0}, "also Kd = 1 s⁻¹ damps Kp = 50 s⁻² too little"),
         ({"x_des": (0.5, 0.1)}, "with Kp = 50, Kd = 40"),
         ({"x_des": (0.5, 0.1)}, "not within 2 % of the initial error of 0.282 m"),
         ({"x_des": (0.5, 0.1), "Kp": (900.0, 100.0)}, "with Kp = (900, 100), Kd = 40"),
@@ -167,11 +166,7 @@ def test_a_load_that_slows_a_sampled_loop_makes_it_stable() -> None:
     """The gains are unstable by the model of the controller, and the error still decays."""
     settings = {"control_period": 0.1, "Kp": 14.0, "Kd": 21.2, "gravity": 0.0, "payload": 0.5}
     lines = twodof.simulate(fmu_of("arm", "task"), settings=settings, stop_time=3.0).verdict.lines
-    assert (
-        "still approaches" in lines[0]
-        and "the payload of 0.5 kg" in lines[1]
-        and not any("unstable" in line for line in lines)
-    )
+    assert "still approaches" in lines[0] and not any("unstable" in line for line in lines)
 
 
 def test_a_good_run_of_a_continuous_joint_beyond_a_turn_is_not_in_degrees() -> None:
@@ -190,13 +185,13 @@ def test_a_moving_target_whose_velocity_the_controller_does_not_know() -> None:
     assert quick.outcome == "followed" and not quick.causes
 
 
-def test_a_push_that_only_shows_in_peaks_is_no_cause() -> None:
-    """The torque is 0 again at the end; a peak does not explain an error."""
+def test_a_push_that_ended_before_the_end_is_named_with_the_time_that_its_error_needs() -> None:
+    """The torque is 0 again at the end; its error decays with the gains."""
     push = [(4.3, {"tau_ext[1]": 2.0}), (4.6, {"tau_ext[1]": 0.0})]
     lines = twodof.simulate(fmu_of("arm", "task"), changes=push).verdict.lines
-    assert lines[0].endswith("; no cause is seen in the samples") and lines[1].startswith(
-        "note: joint 'joint1' has a peak"
-    )
+    words = "tau_ext[1] changed from 2 to 0 at 4.6 s, and an error needs about 3.03 s to decay to 2 %; stop later"
+    assert words in lines[0] and lines[1].startswith("note: joint 'joint1' has a peak")
+    assert twodof.simulate(fmu_of("arm", "task"), changes=push, stop_time=11.0).verdict.outcome == "reached"
 
 
 def test_a_run_that_starts_at_its_target_says_so() -> None:

@@ -227,7 +227,9 @@ class Recording:
                     v[new] = np.gradient(self.q[new], self.t[new], axis=0)
         values = {"q": self.q, "v": v, "x": x, "tau": self.tau if self.tau.shape == shape else none, "quat": quat}
         samples = {name: each[new] for name, each in values.items()}
-        return judged(setup, self.t[new], samples, {name: each[new] for name, each in targets.items() if each.size})
+        aims = {name: each[new] for name, each in targets.items() if each.size}
+        changes = [(k * setup.step, held) for k, held in self.schedule[1:]] if setup.starts else []
+        return judged(setup, self.t[new], samples, aims, changes)
 
     @cached_property
     def x(self) -> Array:

@@ -27,6 +27,7 @@ KINDS = {
 }
 """Kinds of causes in their order; a cause may lead to those after it."""
 FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
+SMALL = 0.02  # part of an error below which a cause does not count
 MANY_CHANGES = 12  # changes of a target beyond which it counts as moving
 
 
@@ -34,11 +35,12 @@ class Cause(NamedTuple):
     """A cause in words, and its kind, a key of KINDS.
 
     Attributes:
-        share: share of the samples or of a limit, by which causes are ranked; 0 without one.
-        joint: joint concerned, or "".
+        share: share of the samples or of a limit, by which causes of a kind are ranked; 0 without one.
+        joint, subject: joint, and input or parameter, concerned; or "".
         time: time at which it was first seen, s since the first sample; None if it holds for the whole run.
         point: nearest reachable position in the root frame, m; () for other kinds.
         noted: whether it is a consequence of another cause or of the motion.
+        part: part of the error late in the run that this cause has, as in ``balance``; None if it is unknown.
     """
 
     kind: str
@@ -48,6 +50,8 @@ class Cause(NamedTuple):
     time: float | None = None
     point: tuple[float, ...] = ()
     noted: bool = False
+    subject: str = ""
+    part: float | None = None
 
 
 def point_text(values: Array) -> str:

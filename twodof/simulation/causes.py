@@ -1,32 +1,33 @@
 """Causes of a run's failure, the root cause first."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from math import inf, pi, radians
+from operator import itemgetter
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT
-from .cause import FLOOR, KINDS, MANY_CHANGES, Cause, point_text
-from .controller_causes import DRAG, damping, feedforward, gains, load, sampled, slow, vanishing
-from .judge import AT_LIMIT, BAND, Judge
+from .aim import BAND
+from .cause import FLOOR, KINDS, SMALL, Cause, point_text
+from .controller_causes import damping, feedforward, gains, load, sampled, slow, unsettled
+from .judge import AT_LIMIT, Judge
 
 MOST = 20  # causes in a verdict
 OFTEN = 0.05  # share of samples from which on a state is a cause
 NEAR_SINGULAR = 0.02  # ratio of the smallest to the largest singular value
 LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
+TURNS_ON_PURPOSE = 6.0 * pi  # rad: a joint without limits may turn this far, if it reaches its target
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
+MOVING = ("unstable", "sampling", "damping", "time")  # kinds of errors that still move
 GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
-SHIFTED = 0.3  # ratio of the extremes of an error to both sides, below which it is shifted
-STEADY = ("feedforward", "friction", "load")  # kinds that shift the error about which a motion swings
-BEFORE_TIME = ("diverged", "degrees", "time")  # kinds that precede others if the errors vanish as the gains let them
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
-BEFORE_REACH = ("diverged", "degrees", "gain", "feedforward", "unstable", "load", "friction")
-# Kinds that precede a target out of reach by less than half of the error at the end.
-EXPLAINED = 0.1  # deviation of the error at the end from the distance out of reach that explains it, relative
+LASTING = 0.5  # part of an error in motion below which the error does not approach 0
+EXPLAINED = 0.1  # part of an error that a target out of reach may leave to its consequences
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
 
 
@@ -38,78 +39,92 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         missed: outputs that are not at their targets: "x", "quat" or "q".
         motion: motion at the end of the run.
     """
-    found, rests = [*_degrees(judge), *_beyond_limits(judge)], judge.changes <= MANY_CHANGES
-    fades = rests and vanishing(judge, missed)  # errors from a target that rests
-    ill = bool(missed) or motion == "diverging"
+    from .balance import parts_of_error  # Pinocchio takes a quarter of a second to import
+
+    parts, rests = parts_of_error(judge, missed), not judge.moving
+    found = [*_degrees(judge, missed), *_beyond_limits(judge)]
     if missed:
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
-        loaded = any(cause.kind == "load" for cause in found)
-        sticking = [*_friction(judge, missed, loaded)]  # then the rate of an error tells nothing, unless it is nominal
-        found += [*sticking, *_singular(judge), *(slow(judge, missed) if fades or (rests and not sticking) else ())]
-    if ill or not judge.aims:
+        sticking = [*_friction(judge, missed, parts)]  # without parts, the rate of an error then tells nothing
+        found += [*sticking, *_singular(judge), *(slow(judge, missed) if rests and (parts or not sticking) else ())]
+    if missed or motion == "diverging" or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *sampled(judge)]
     if missed:
         found += damping(judge, ["x", "quat"] if motion in ("oscillating", "diverging") else missed)
-    order, motors = [*KINDS], max((cause.share for cause in found if cause.kind == "saturation"), default=0.0)
-    driven = _driven(judge)
+    restless = max(_weight("time", "", parts), abs(parts.get(("sampling", ""), 0.0)))
+    if restless > LASTING and not any(cause.kind in MOVING for cause in found):
+        found += unsettled(judge, missed)
+    ranked = _by_parts(judge, found, parts) if parts else _by_kinds(judge, found)
+    if not ranked:
+        return ()
+    root, *others = ranked[:MOST]
+    return root._replace(noted=bool(missed) and root.kind in MOTION), *others  # a peak makes no error
+
+
+def _weight(kind: str, subject: str, parts: Mapping[tuple[str, str], float]) -> float:
+    """Return the part of the error that a kind of cause has: all joints' for a force, and the motion's for a gain."""
+    if kind in MOVING:
+        return parts.get(("motion", ""), 0.0) + parts.get(("sampling", ""), 0.0)
+    if kind in ("friction", "limit", "saturation"):
+        return sum(part for (of, _), part in parts.items() if of == kind)
+    return parts.get(("load", "damping") if kind == "drag" else (kind, subject), 0.0)
+
+
+def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, str], float]) -> list[Cause]:
+    """Return the causes by their parts in the error, without those that are small; opposed forces are noted."""
+    beyond = max((cause.part or 0.0 for cause in found if cause.kind == "reach"), default=0.0)
+    bounds = sum(_weight(kind, "", parts) for kind in ("limit", "singularity"))
+
+    def weight(cause: Cause) -> float:
+        if cause.kind == "reach":
+            return cause.part or 0.0
+        own = _weight(cause.kind, cause.subject, parts)
+        if cause.kind in ("unstable", "sampling"):
+            return max(own, *(_weight(kind, "", parts) for kind in FOLLOWING))
+        if cause.kind == "singularity" and beyond > SMALL:
+            return min(own, beyond)
+        led = beyond > SMALL and cause.kind == "limit"
+        return own if not led else min(own, bounds - beyond) if bounds - beyond > EXPLAINED else 0.0
+
+    ranked = []
+    for cause in found:
+        if cause.kind == "time" and _weight("time", "", parts) < LASTING:
+            continue  # the error does not approach 0
+        grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
+        first, most = grows or cause.kind in ("diverged", "degrees"), weight(cause)
+        own = parts.get((cause.kind, cause.joint), most) if cause.joint else most
+        opposed = cause.kind in FOLLOWING and most < SMALL and abs(own) >= SMALL
+        if first or cause.kind in MOTION or opposed or (most >= SMALL and abs(own) >= SMALL):
+            after = inf if cause.kind in MOTION or opposed else -round(most, 1)
+            part = None if cause.kind in MOTION or first else most
+            cause = cause._replace(noted=opposed or cause.kind in MOTION, part=part)
+            ranked.append(((not first, after, [*KINDS].index(cause.kind), -own, -cause.share), cause))
+    causes = [cause for _, cause in sorted(ranked, key=itemgetter(0))]
+    root = causes[0].kind if causes else ""
+    led = ("singularity",) if root == "reach" else FOLLOWING if root in ("degrees", "unstable", "sampling") else ()
+    return [cause._replace(noted=cause.noted or cause.kind in led) for cause in causes]
+
+
+def _by_kinds(judge: Judge, found: Sequence[Cause]) -> list[Cause]:
+    """Return the causes in the order of their kinds, for runs whose forces are unknown."""
+    motors, driven = max((cause.share for cause in found if cause.kind == "saturation"), default=0.0), _driven(judge)
 
     def passing(cause: Cause) -> bool:  # a joint in the way saturates motors no longer
         return cause.kind == "limit" and (cause.share < motors or cause.joint in driven)
 
-    near = any(cause.point and _excess(judge, cause) > cause.share for cause in found)
-    swings = any(cause.kind == "damping" for cause in found) and all(_swings(judge, name) for name in missed)
-    pushed = any(cause.kind == "load" and cause.share > DRAG for cause in found)  # perhaps to a limit
-
-    def rank(cause: Cause) -> tuple[bool, int, bool, float]:
-        grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
-        late = (near and cause.kind not in BEFORE_REACH) or (fades and not grows and cause.kind not in BEFORE_TIME)
-        late |= swings and cause.kind in STEADY
-        kind = "drag" if passing(cause) else "load" if pushed and cause.kind == "limit" else cause.kind
-        return late, order.index(kind), cause.kind == "limit", -cause.share
-
-    if not found:
-        return ()
-    root, *others = sorted(found, key=rank)[:MOST]
-    root = root._replace(noted=bool(missed) and root.kind in MOTION)  # a peak makes no error
-    led = [cause for cause in others if passing(cause) or _leads(root, cause, judge)]
-    since = min((cause.time for cause in led if cause.time is not None), default=inf)
-    led += [cause for cause in others if cause.kind == "singularity" and (cause.time or 0.0) >= since]
-    return root, *(cause._replace(noted=cause in led or cause.kind in MOTION) for cause in others)
+    causes = sorted(found, key=lambda each: ([*KINDS].index("drag" if passing(each) else each.kind), -each.share))
+    leads = bool(causes) and causes[0].kind in ("reach", "degrees", "unstable", "sampling")
+    noted = [passing(each) or each.kind in MOTION or (leads and each.kind in FOLLOWING) for each in causes]
+    return [cause._replace(noted=is_noted) for cause, is_noted in zip(causes, noted)]
 
 
-def _leads(root: Cause, cause: Cause, judge: Judge) -> bool:
-    """Return whether the root leads to another cause; a target out of reach does if it explains the whole error."""
-    if root.kind == "reach" and not root.point:
-        return cause.kind == "limit" and cause.joint == root.joint
-    if root.kind == "reach":
-        return cause.kind in FOLLOWING and _excess(judge, root) <= EXPLAINED * root.share
-    return cause.kind in FOLLOWING and root.kind in ("degrees", "unstable", "sampling")
-
-
-def _excess(judge: Judge, reach: Cause) -> float:
-    """Return by how much the error at the end exceeds the distance, or the angle, by which a target is out of reach."""
-    gap = np.linalg.norm(judge.wanted("x") - np.array(reach.point)[judge.setup.rows])
-    return judge.aims["x" if np.isclose(gap, reach.share) else "quat"].last - reach.share
-
-
-def _swings(judge: Judge, name: str) -> bool:
-    """Return whether an error passes zero to and fro in the second half of the move, hardly shifted to one side."""
-    half = judge.history() >= 0.5 * (judge.changed + judge.duration)
-    size = judge.error_history(name)[half]
-    if name == "quat" or not len(size):  # an angle has no sign
-        return len(size) > 0 and bool(size.min() < SHIFTED * size.max())
-    e = judge.wanted(name) - judge.history(name)[half]
-    along = e @ e[int(size.argmax())]
-    return bool(along.min() < -SHIFTED * along.max())
-
-
-def _degrees(judge: Judge) -> Iterator[Cause]:
-    setup = judge.setup
+def _degrees(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    setup, least = judge.setup, LEAST_TURN if missed else TURNS_ON_PURPOSE
     for group in ("q_des", "q_start"):
         for i, (value, joint) in enumerate(zip(judge.given(group), setup.joints)):
             fits = setup.low[i] - AT_LIMIT <= radians(value) <= setup.high[i] + AT_LIMIT
             way = value if group == "q_start" else value - judge.first[i]  # that of a continuous joint may be short
-            if setup.units[i] == "rad" and min(abs(value), abs(way)) > LEAST_TURN and fits:
+            if setup.units[i] == "rad" and min(abs(value), abs(way)) > least and fits:
                 text = f"{group}[{i + 1}] = {value:g} rad: {value:g}°? {value:g}° is {radians(value):.4g} rad"
                 yield Cause("degrees", text, 1.0, joint)
 
@@ -129,13 +144,14 @@ def _beyond_limits(judge: Judge) -> Iterator[Cause]:
 
 def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup = judge.setup
-    known = {cause.joint for cause in _degrees(judge)}
+    known = {cause.joint for cause in _degrees(judge, missed)}
     for joint, unit, wanted, low, high in zip(setup.joints, setup.units, judge.wanted("q"), setup.low, setup.high):
         by, limit = (low - wanted, low) if wanted < low else (wanted - high, high)
         if by > AT_LIMIT and joint not in known:
             text = f"the target {wanted:.4g} {unit} of joint '{joint}' is out of reach by {by:.4g} {unit}"
             degrees = "; is it in degrees?" if unit == "rad" and abs(wanted) > LEAST_TURN else ""
-            yield Cause("reach", f"{text}: its limit is {limit:.4g} {unit}{degrees}", float(by), joint)
+            part = _part_of(judge, missed, "q", by)
+            yield Cause("reach", f"{text}: its limit is {limit:.4g} {unit}{degrees}", float(by), joint, part=part)
     robot, target, quat = setup.robot, judge.wanted("x"), judge.wanted("quat")
     if robot is None or setup.frame not in robot.links or not target.size or not {"x", "quat"} & {*missed}:
         return
@@ -157,13 +173,23 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         text += f"; the nearest reachable point is {point_text(best.point[axes])} m"
         gap = float(np.linalg.norm(judge.end("x") - best.point[axes]))
         text += f", {gap:.4g} m from the end effector" * (gap > size)
-        yield Cause("reach", text, best.distance, point=tuple(best.point.tolist()))
+        part = _part_of(judge, missed, "x", target - best.point[axes])
+        yield Cause("reach", text, best.distance, point=tuple(best.point.tolist()), part=part)
     elif quat.size:
         best = search(quat=quat, low=setup.low, high=setup.high, q=judge.end("q"))
         if best.distance > size or best.angle > max(BAND * judge.aims["quat"].first, 1e-3):
             text = f"the target pose is out of reach by {best.angle:.4g} rad and {best.distance:.4g} m"
             share = best.distance if best.distance > size else best.angle
-            yield Cause("reach", text, share, point=tuple(best.point.tolist()))
+            both = _part_of(judge, missed, "x", target - best.point[axes]), _part_of(judge, missed, "quat", best.angle)
+            yield Cause("reach", text, share, point=tuple(best.point.tolist()), part=sum(both))
+
+
+def _part_of(judge: Judge, missed: Sequence[str], name: str, gap: ArrayLike) -> float:
+    """Return the ratio of a gap, a vector or an angle, to the error late in the run, divided by the missed outputs."""
+    if name not in missed:
+        return 0.0
+    size = np.sqrt(np.mean(np.square(judge.error_history(name)[judge.late])))
+    return float(np.linalg.norm(gap) / max(size, FLOOR) / len(missed))
 
 
 def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -225,9 +251,9 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
             yield Cause("saturation", text, float(judge.share[i]), joint, float(t[inside[:, i].argmax()]))
 
 
-def _friction(judge: Judge, missed: Sequence[str], loaded: bool) -> Iterator[Cause]:
-    """Yield joints that stick; small friction also holds a joint where an unknown load balances the controller."""
-    setup, tau = judge.setup, np.abs(judge.history("tau")[judge.late])
+def _friction(judge: Judge, missed: Sequence[str], parts: Mapping[tuple[str, str], float]) -> Iterator[Cause]:
+    """Yield joints that stick, or whose friction has a part in the error."""
+    setup = judge.setup
     friction, v = setup.given("friction"), np.abs(judge.end("v"))
     q, driven = judge.end("q"), _driven(judge)
     at_limit = np.minimum(np.abs(q - setup.low), np.abs(q - setup.high)) <= AT_LIMIT
@@ -237,14 +263,15 @@ def _friction(judge: Judge, missed: Sequence[str], loaded: bool) -> Iterator[Cau
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > FLOOR if judge.wanted("q").size else bool(missed)
         moved = max(0.0, float(judge.moved[i]))
         held = judge.duration - moved > OFTEN * judge.duration
-        least = DRAG * tau[:, i].max() if loaded and tau.shape[1] > i else 0.0
-        off = off and joint not in idle
-        if friction[i] > least and off and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i]):
+        off = off and joint not in idle and i not in pressed and (held or v[i] <= CREEPING * judge.speed[i])
+        if friction[i] and (abs(parts.get(("friction", joint), 0.0)) >= SMALL if parts else off):
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
-            text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"
-            text += "; raise Kp" * bool(judge.aims)
+            creeps = not held and v[i] > CREEPING * judge.speed[i]
+            stops = "slows it down" if creeps else "stops it short of its target"
+            text = f"{size} {f'holds it from {moved:.4g} s on' if held else stops}{'; raise Kp' * bool(judge.aims)}"
             share = 1.0 - moved / judge.duration if held else 0.0
-            yield Cause("friction", f"joint '{joint}' sticks: {text}", share, joint, moved if held else None)
+            state = "creeps" if creeps else "sticks"
+            yield Cause("friction", f"joint '{joint}' {state}: {text}", share, joint, moved if held else None)
 
 
 def _singular(judge: Judge) -> Iterator[Cause]:

@@ -6,14 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .cause import FLOOR, MANY_CHANGES, Cause, point_text
-from .judge import AT_LIMIT, BAND, Judge
+from .aim import BAND
+from .cause import FLOOR, Cause, point_text
+from .judge import AT_LIMIT, OF_THE_END, Judge
 from .sampled_loop import quickest_gains, spectral_radius, stable_gains
 
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 SLIGHT = 1e-4  # torque, relative to the largest effort, below which a load does not count
 LEVER = 1.0  # m: of a force at the end effector
 PERIODS = ("control_period", "control_delay")
+WEAK = 0.2  # damping ratio below which damping is too small
 SWINGING = 0.7  # damping ratio below which an error that shrinks once will grow again
 FADING = 0.7  # ratio of mean speeds, of the second to the first half of the last samples, that shows a decay
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
@@ -55,8 +57,9 @@ def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     groups = {"x": ("xd_des", "xdd_des"), "quat": ("omega_des", "alpha_des"), "q": ("v_des", "a_des")}
     for group in (group for name in missed for group in groups[name]):
         values = judge.given(group)
-        if values.any() and judge.changes <= MANY_CHANGES:
-            yield Cause("feedforward", f"{group} = {point_text(values)} is not 0, while the target rests", 1.0)
+        if values.any() and not judge.moving:
+            text = f"{group} = {point_text(values)} is not 0, while the target rests"
+            yield Cause("feedforward", text, 1.0, subject=group)
     for stiff, damp, group in (
         ("Kp", "Kd", groups["q" if "q" in missed else "x"][0]),
         ("Kp_rot", "Kd_rot", "omega_des"),
@@ -64,22 +67,27 @@ def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         of = "quat" if stiff == "Kp_rot" else "q" if "q" in missed else "x"
         lags = [d / p for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
         still = not judge.given(group).any() and f"{group}[1]" not in judge.inputs
-        if of in missed and judge.changes > MANY_CHANGES and still and lags:
+        if of in missed and judge.moving and still and lags:
             text = f"the target moves, and {group} is 0: the lag is {damp}/{stiff} = {max(lags):.3g} s"
             yield Cause("time", f"{text}; set {group}, raise {stiff} or lower {damp}", 0.5)
 
 
 def load(judge: Judge) -> Iterator[Cause]:
     """Yield loads, and the damping of joints, that the controller does not know."""
-    payload, switch = judge.held.get("payload"), "payload_known"
-    own = next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
-    payload, believed = payload or 0.0, judge.held.get(f"{own}payload", 0.0) if judge.held.get(switch) else 0.0
+    switch, (payload, believed) = "payload_known", payloads(judge)
+    own = controller_prefix(judge)
     if payload and believed != payload and (share := _share(judge, payload * GRAVITY * LEVER)) > SLIGHT:
         remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
-        yield Cause("load", f"the controller does not know the payload of {payload:g} kg; {remedy}", share)
+        text = f"the controller does not know the payload of {payload:g} kg; {remedy}"
+        yield Cause("load", text, share, subject="payload")
     elif believed and not payload:
         text = f"the controller knows a payload of {believed:g} kg, which the plant does not have; set {own}payload=0"
-        yield Cause("load", text, _share(judge, believed * GRAVITY * LEVER))
+        yield Cause("load", text, _share(judge, believed * GRAVITY * LEVER), subject="payload")
+    for name in ("gravity", "payload_com", "armature"):
+        real, model = judge.given(name), judge.given(own + name)
+        if own and len(real) == len(model) and (real != model).any():
+            text = f"the controller's model has {name} = {point_text(model)}, the plant {name} = {point_text(real)}"
+            yield Cause("load", f"{text}; set {own}{name} to that of the plant", 1.0, subject=name)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     drags = [_share(judge, d * speed) for d, speed in zip(judge.given("damping"), judge.speed)]
@@ -89,12 +97,25 @@ def load(judge: Judge) -> Iterator[Cause]:
     names = "of any joint" if len(each) == len(usual) > 2 else f"of joints {', '.join(map(repr, each))}"
     kind, tail, share = ("load", "", max(drags)) if heavy else ("drag", " in the URDF", 0.0)
     if each and (heavy or _drags(judge)):
-        yield Cause(kind, f"the controller does not know the damping {names}{tail}", share)
+        yield Cause(kind, f"the controller does not know the damping {names}{tail}", share, subject="damping")
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
         share = _share(judge, np.abs(values).max(initial=0.0) * (LEVER if group == "f_ext" else 1.0))
         if share > SLIGHT:
-            yield Cause("load", f"the controller does not know {group} = {point_text(values)}{unit}", share)
+            text = f"the controller does not know {group} = {point_text(values)}{unit}"
+            yield Cause("load", text, share, subject=group)
+
+
+def payloads(judge: Judge) -> tuple[float, float]:
+    """Return the payload of the plant and that of the controller's model, kg."""
+    believed = judge.held.get(f"{controller_prefix(judge)}payload", 0.0) if judge.held.get("payload_known") else 0.0
+    return float(judge.held.get("payload") or 0.0), float(believed)
+
+
+def controller_prefix(judge: Judge) -> str:
+    """Return the prefix of the controller's variables in a system, or ""."""
+    switch = "payload_known"
+    return next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
 
 
 def _share(judge: Judge, torque: float) -> float:
@@ -114,9 +135,9 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     """Yield sampled loops that are unstable, or else a joint that reverses as fast as the steps."""
     v, setup = judge.tail("v")[-256:], judge.setup
     sampling = [setup.starts.get(name, 0.0) for name in PERIODS]
-    if not any(sampling) and any(name.endswith(".control_period") for name in setup.starts):
-        sampling = [setup.step, 0.0]  # the controller is a component, and acts at communication points
-    continuous = bool(judge.aims) and not any(sampling) and judge.changes <= MANY_CHANGES
+    if controller_prefix(judge):  # the controller is a component, and acts at communication points
+        sampling[0] = max(sampling[0], setup.step)
+    continuous = bool(judge.aims) and not any(sampling) and not judge.moving
     if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
         return
     if any(sampling) and (found := [*_unstable(judge, *sampling)]):
@@ -181,6 +202,8 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
     every = [*_loops(judge, period, delay)]
     for group, output in (("Kp", "q" if "q" in judge.aims else "x"), ("Kp_rot", "quat"), ("", "")):
         loop = max((loop for loop in every if loop.stiff == group), default=None)
+        if loop is not None and loop.Kd < WEAK * 2.0 * sqrt(loop.Kp) and late_by(judge, _decay(loop)) > judge.duration:
+            continue  # the loop lacks damping at any period
         if loop is None or (judge.held.get("payload") and (_rests(judge) or _rate(judge, output) > 0.0)):
             continue  # a load lowers the true gains
         rate = -log(loop.radius) / period
@@ -194,7 +217,7 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
             continue
         gains, are = " and ".join(_named(judge, loop, (" s⁻²", " s⁻¹"))), "are" if group else "is"
         late = f" and control_delay = {delay:g} s" * bool(delay)
-        own = bool(judge.setup.starts.get("control_period"))
+        own = judge.setup.starts.get("control_period") == period
         step = f"control_period = {period:g} s" if own else f"communication steps of {period:g} s"
         text = f"{gains} {are} too high for {step}{late}: {state}"
         yield Cause("unstable", text + _better(judge, loop, period, delay), -rate)
@@ -246,7 +269,7 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     for stiff, damp in dict.fromkeys(("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd") for name in missed):
         Kp, Kd = judge.given(stiff), judge.given(damp)
         ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
-        if ratios and min(ratios)[0] < 0.2:
+        if ratios and min(ratios)[0] < WEAK:
             ratio, i, p, d = min(ratios)
             names = [_gain(judge, group, i) for group in (damp, stiff)]
             text = f"{names[0]} = {d:g} s⁻¹ damps {names[1]} = {p:g} s⁻² too little"
@@ -254,7 +277,13 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    """Yield a cause for each output whose error still shrinks, with the remaining time by its rate."""
+    """Yield a cause for each output whose error still shrinks, with the remaining time by its rate.
+
+    After a late change of an input, the rate is that of its consequences, and the change is the cause.
+    """
+    if (text := _late_change(judge)) and not judge.moving:
+        yield Cause("time", text, judge.duration)
+        return
     for name in missed:
         rate, aim = _rate(judge, name), judge.aims[name]
         stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
@@ -263,6 +292,7 @@ def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         if min(ratios, default=1.0) < SWINGING:  # an error passes 0 and grows again
             rate = min(rate, *(0.5 * d for _, d in pairs))
         left = log(max(aim.last / max(BAND * aim.first, FLOOR), 1.0)) / rate if rate else 0.0
+        left += OF_THE_END * (judge.duration - judge.changed)  # the error must stay there
         what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
         if rate and left < 1000.0 * judge.duration:
             late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
@@ -271,22 +301,38 @@ def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; {remedy}, or stop later", left)
 
 
-def vanishing(judge: Judge, missed: Sequence[str]) -> bool:
-    """Return whether each error shrinks as the gains let it, and towards less than half of its last value.
+def unsettled(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    """Yield the reason of an error that moves, and neither decays steadily nor lacks damping."""
+    rates = [_decay(loop) for loop in _loops(judge, 1.0, 0.0) if loop.Kp > 0.0 and loop.Kd > 0.0]
+    left, sensors = late_by(judge, min(rates, default=inf)), [*_sensors(judge, int(judge.speed.argmax()))]
+    settings = " and ".join(f"{name} = {judge.setup.starts[name]:g} s" for name in PERIODS if judge.held.get(name))
+    if left > 0.0:
+        text = f"the motion has not settled: with these gains it takes about {left:.3g} s more to 2 %"
+        yield Cause("time", f"{text}; raise the gains, or stop later", left)
+    elif sensors:
+        text = f"joint '{judge.setup.joints[int(judge.speed.argmax())]}' is measured with {', '.join(sensors)}"
+        yield Cause("sampling", f"{text}: the controller does not see smaller errors", 0.5)
+    elif settings:
+        text = f"the motion does not settle with {settings}: the efforts of the controller are too late"
+        yield Cause("sampling", f"{text}; reduce {'them' if ' and ' in settings else 'it'}", 0.5)
 
-    The limit of a geometric sequence is e₂ − (e₂ − e₁)²/(e₀ − 2 e₁ + e₂) (Aitken, 1926).
-    """
-    for name in missed:
-        size = np.array(judge.error_history(name))[judge.late]
-        before, middle, last = size[:: max(1, (len(size) - 1) // 2)][:3] if len(size) > 2 else (0.0, 0.0, 1.0)
-        bend = before - 2.0 * middle + last
-        group = "Kp_rot" if name == "quat" else "Kp"
-        loops = [loop for loop in _loops(judge, 1.0, 0.0) if loop.stiff == group and loop.Kp > 0.0]
-        swings = any(loop.Kd < SWINGING * 2.0 * sqrt(loop.Kp) for loop in loops)
-        slower = _rate(judge, name) < SPOILT * min(map(_decay, loops), default=inf)
-        if swings or slower or (bend > 0.0 and last - (last - middle) ** 2 / bend > 0.5 * last):
-            return False
-    return bool(missed)
+
+def _late_change(judge: Judge) -> str:
+    """Return a change of an input, after which the time was too short for an error to decay, in words."""
+    rates = [_decay(loop) for loop in _loops(judge, 1.0, 0.0) if loop.Kp > 0.0 and loop.Kd > 0.0]
+    if judge.latest is None or judge.latest[0] <= judge.changed:
+        return ""
+    t, name, before, after = judge.latest
+    needed = log(1.0 / BAND) / min(rates, default=1e-9)
+    if judge.duration - t >= needed:
+        return ""
+    text = f"{name} changed from {before:.4g} to {after:.4g} at {t:.4g} s"
+    return f"{text}, and an error needs about {needed:.3g} s to decay to 2 %; stop later"
+
+
+def late_by(judge: Judge, rate: float) -> float:
+    """Return by how much an error that decays with a rate, 1/s, needs more time to 2 % than it has, s."""
+    return log(1.0 / BAND) / max(rate, 1e-9) - (judge.duration - judge.changed)
 
 
 def _rate(judge: Judge, name: str) -> float:

@@ -13,38 +13,16 @@ from math import inf, nan, sqrt
 import numpy as np
 
 from ..plant.variables import EXACT as EXACT
+from .aim import BAND, SMALLEST_MOVE, Aim
 from .cause import MANY_CHANGES
 from .setup import Array, Setup
 
-BAND = 0.02
-"""Band of the settling time, as a fraction of the initial error."""
-SMALLEST_MOVE = 1e-9  # m: a smaller move counts as a start at the target, without a settling time
+OF_THE_END = 0.1  # last fraction of a run, in which a moving target still changes and an error must stay in its band
 AT_LIMIT = 1e-9  # rad or m; the plant sets a stopped joint to its limit exactly
 BLOCK = 8192  # samples that are judged at a time; smaller blocks suffer from cold caches
 KEPT = 2048  # minimum number of kept samples, of the whole run and of its end
 OUTPUTS = ("q", "v", "x", "tau", "quat")
 TARGETS = {"x": "x_des", "quat": "quat_des", "q": "q_des"}
-
-
-class Aim:
-    """Errors of one output from its target: position, orientation or joints."""
-
-    def __init__(self) -> None:
-        self.squares = 0.0
-        self.began, self.outside, self.first, self.last, self.past = 0.0, -inf, nan, nan, 0.0
-        self.way: Array = np.empty(0)
-
-    def begin(self, t: float, e: Array, size: float) -> None:
-        """Start a move to a new target, from an error vector (empty for an angle) and its magnitude."""
-        self.began, self.outside, self.first, self.last, self.past, self.way = t, t, size, size, 0.0, e
-
-    def add(self, t: Array, e: Array, size: Array) -> None:
-        """Add N samples of the move."""
-        if size.max() > BAND * self.first:
-            self.outside = t[np.flatnonzero(size > BAND * self.first)[-1]]
-        if self.way.size and self.first >= SMALLEST_MOVE:
-            self.past = max(self.past, -float((e @ self.way).min()) / self.first**2)
-        self.last = float(size[-1])
 
 
 class Judge:
@@ -60,6 +38,7 @@ class Judge:
     Attributes:
         count: samples so far.
         inputs: present values of changed inputs.
+        latest: last change of an input that is no target: time in s, name, and value before and after.
         aims: errors by output, for outputs with a target.
         targets: present targets by output, 1 × values.
         effort, speed: largest magnitude for each joint, n values; the following attributes also have n values.
@@ -73,6 +52,7 @@ class Judge:
     def __init__(self, setup: Setup, sizes: Sequence[int]) -> None:
         n = len(setup.joints)
         self.setup, self.inputs = setup, dict[str, float]()
+        self.latest: tuple[float, str, float, float] | None = None
         self.count, self.changes, self.changed = 0, 0, -inf
         self.aims: dict[str, Aim] = {}
         self.effort, self.speed, self.chatter = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -97,13 +77,22 @@ class Judge:
 
     def change(self, inputs: Mapping[str, float]) -> None:
         """Receive inputs that apply from the last sample on."""
-        self.inputs |= inputs
+        count = self.count + self.rows.tell() // (8 * int(self._ends[-1]))
+        self.note(max(0, count - 1) * self.setup.step, inputs)
         held = self._changed[-1][1]
         for variable in inputs.keys() & self._where.keys():
             name, i = self._where[variable]
             held = {**held, name: held[name].copy()}
             held[name][i] = inputs[variable]
-        self._changed.append((self.count + self.rows.tell() // (8 * int(self._ends[-1])), held))
+        self._changed.append((count, held))
+
+    def note(self, t: float, inputs: Mapping[str, float]) -> None:
+        """Note inputs that changed at a time, s, as the present ones; the last one that is no target as ``latest``."""
+        for name in inputs.keys() - self._where.keys():
+            before = self.inputs.get(name, self.setup.starts.get(name, inputs[name]))
+            if before != inputs[name]:
+                self.latest = t, name, float(before), float(inputs[name])
+        self.inputs |= inputs
 
     def flush(self) -> None:
         """Judge the waiting rows."""
@@ -268,7 +257,12 @@ class Judge:
     @property
     def late(self) -> slice:
         """Samples of the history by which a state is judged: the last quarter, or all for a moving target."""
-        return slice(0 if self.changes > MANY_CHANGES else -(len(self.history()) // 4 + 1), None)
+        return slice(0 if self.moving else -(len(self.history()) // 4 + 1), None)
+
+    @property
+    def moving(self) -> bool:
+        """True for a target that changes often, and still changes at the end of the run."""
+        return self.changes > MANY_CHANGES and self.changed > (1.0 - OF_THE_END) * self._time
 
     @property
     def held(self) -> Mapping[str, float]:

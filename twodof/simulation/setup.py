@@ -130,7 +130,9 @@ def _whole(starts: Mapping[str, float]) -> Mapping[str, float]:
     if len(parts) != 1:
         return starts
     own = {name.removeprefix(parts[0]): value for name, value in starts.items() if name.startswith(parts[0])}
-    return {**starts, **{name: value for name, value in own.items() if name.partition("[")[0] in OF_THE_CONTROLLER}}
+    period = max(starts.get("control_period", 0.0), own["control_period"])  # the plant may sample its effort, too
+    own = {name: value for name, value in own.items() if name.partition("[")[0] in OF_THE_CONTROLLER}
+    return {**starts, **own, "control_period": period}
 
 
 def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, float]) -> Setup:

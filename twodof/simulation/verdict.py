@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from math import inf, isfinite
 from typing import Any, NamedTuple
@@ -11,15 +11,15 @@ import numpy as np
 
 from ..bounds import MAX_VALUE
 from ..files import NUMBER
-from .cause import FLOOR, MANY_CHANGES, Cause
+from .aim import BAND
+from .cause import FLOOR, Cause
 from .causes import causes
 from .expressions import expression
-from .judge import BAND, BLOCK, OUTPUTS, Judge
+from .judge import BLOCK, OF_THE_END, OUTPUTS, Judge
 from .motion import motion_of
 from .setup import Array, Setup
 from .verdict_text import lines_of
 
-OF_THE_END = 0.1  # last fraction of a run, in which a moving target still changes and an error must stay in its band
 HELD = 1e-3  # m, rad: a smaller error of an output that is held, and that only falls, is no failure
 FOLLOWED = 0.1  # fraction of the target's travel: with a larger RMS error in the second half, a target is not followed
 
@@ -99,6 +99,8 @@ SHAPE = {
             "time": NUMBER | None,
             "point": [NUMBER],
             "noted": bool,
+            "subject": str,
+            "part": NUMBER | None,
         }
     ],
     "lines": [str],
@@ -168,7 +170,7 @@ def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:
     motion, found, _ = motion_of(t, signals, scale)
     if found is not None:
         numbers |= {"frequency": found.frequency, "damping": found.damping}
-    moving = judge.changes > MANY_CHANGES and judge.changed > (1.0 - OF_THE_END) * judge.duration
+    moving = judge.moving
     missed = _lagging(judge) if moving else _missed(judge)
     outcome = ("not " if missed else "") + ("followed" if moving else "reached") if judge.aims else "no target"
     motion = "diverging" if known else motion
@@ -177,7 +179,13 @@ def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:
     return Verdict(outcome, motion, judge.count, judge.duration, numbers, why, lines)
 
 
-def judged(setup: Setup, t: Array, values: Mapping[str, Array], targets: Mapping[str, Array]) -> Verdict:
+def judged(
+    setup: Setup,
+    t: Array,
+    values: Mapping[str, Array],
+    targets: Mapping[str, Array],
+    changes: Iterable[tuple[float, Mapping[str, float]]] = (),
+) -> Verdict:
     """Return the verdict of N recorded samples.
 
     Args:
@@ -185,12 +193,15 @@ def judged(setup: Setup, t: Array, values: Mapping[str, Array], targets: Mapping
         t: times since the first sample, s, N.
         values: q, v, x, tau and quat, N rows each; unknown ones have no columns.
         targets: targets of x, quat and q in effect up to each sample, N rows each; NaN before the first target.
+        changes: times, s, and inputs that changed at them.
     """
     rows = np.hstack([values[name] for name in OUTPUTS])
     known = np.isfinite(np.hstack([*targets.values(), np.zeros((len(t), 1))])).all(axis=1)
     finite = (np.abs(rows) <= MAX_VALUE).all(axis=1)
     first, end = int(known.argmax()), len(t) if finite.all() else int(finite.argmin())
     judge = Judge(setup, [values[name].shape[1] for name in OUTPUTS])
+    for time, inputs in changes:
+        judge.note(time, inputs)
     for k in range(first, end, BLOCK):
         part = slice(k, min(k + BLOCK, end))
         judge.judge(t[part], rows[part], {name: target[part] for name, target in targets.items()})

@@ -5,10 +5,12 @@ from math import inf
 
 import numpy as np
 
-from .cause import FLOOR, Cause, point_text
+from .aim import SMALLEST_MOVE
+from .cause import FLOOR, SMALL, Cause, point_text
 from .controller_causes import STILL
-from .judge import AT_LIMIT, SMALLEST_MOVE, Judge
+from .judge import AT_LIMIT, Judge
 
+WHOLE = 0.995  # part of an error that is printed as the whole
 MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
 RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
@@ -65,7 +67,14 @@ def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
             names = "all other joints" if len(joints) == count - 1 > 1 else names
             grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
-    return grouped
+    several = len([cause for cause in grouped if not cause.noted]) > 1
+    return [cause._replace(text=cause.text + _part(cause) * several) for cause in grouped]
+
+
+def _part(cause: Cause) -> str:
+    """Return the part of a cause in the error in words, if it is known and less than all of it."""
+    measured = cause.part is not None and cause.kind != "reach" and SMALL <= cause.part < WHOLE
+    return f" ({100.0 * (cause.part or 0.0):.2g} % of the error)" if measured else ""
 
 
 def _settings(judge: Judge) -> str:

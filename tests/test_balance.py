@@ -1,0 +1,148 @@
+"""Parts of an error by the balance of forces, against closed forms, Pinocchio, and runs without one of two causes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from failures import LARGE_STEPS, fmu_of
+from pytest import approx
+
+import twodof
+from twodof.simulation.balance import parts_of_error
+
+AWAY: dict[str, Any] = {"q_des": (0.9, 0.8)}
+COARSE = {"control_period": 0.001, "q_resolution": (0.05, 0.05), "v_from_q": True}
+HELD = {"limit_effort": True, "payload": 6.0, "payload_known": True}
+
+
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> list[dict[tuple[str, str], float]]:
+    """Collect the parts of each run of the test."""
+    found: list[Any] = []
+
+    def spy(*arguments: Any) -> Any:
+        found.append(parts_of_error(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr("twodof.simulation.balance.parts_of_error", spy)
+    return found
+
+
+def verdict(control: str, stop_time: float = 5.0, **settings: Any) -> twodof.Verdict:
+    return twodof.simulate(fmu_of("arm", control), settings={**LARGE_STEPS, **settings}, stop_time=stop_time).verdict
+
+
+FIRST = [
+    ("task", {"payload": 0.3, "xdd_des": (0.0, 1e-6)}, 5.0, "the payload of 0.3 kg"),
+    ("joint", {"payload": 0.3, "q_des": (0.9, 3.1416)}, 5.0, "the payload of 0.3 kg"),
+    ("joint", {**AWAY, "q_max": (3.0, 0.78), "friction": (0.5, 0.2)}, 5.0, "sticks"),
+    ("joint", {**AWAY, **HELD, "friction": 1e-4}, 5.0, "was saturated"),
+    ("task", {"friction": (0.5, 0.0)}, 5.0, "joint 'joint1' creeps: its friction of 0.5 N·m slows it down"),
+    ("task", {"friction": (0.5, 0.0), "payload": 1e-4}, 5.0, "friction of 0.5 N·m"),
+    ("task", {"f_ext": (0.0, 0.0, 10.0), "q_min": (-0.2, -3.0)}, 5.0, "'joint1' stood at its lower limit"),
+    ("joint", {**AWAY, "Kp": 50.0, "Kd": 7.07}, 0.4, "has not settled: with these gains"),
+    ("task", {"Kp": 20.0, "Kd": 2.0, "payload": 0.001}, 0.5, "has not settled: with these gains"),
+    ("joint", {**AWAY, "friction": (0.01, 0.005), "payload": 0.3}, 5.0, "the payload of 0.3 kg"),
+    ("joint", {**AWAY, "friction": (0.05, 0.02), "payload": 0.002}, 5.0, "friction of 0.0"),
+    ("joint", {**AWAY, "a_des": (20.0, 0.0), "payload": 0.3}, 5.0, "the payload of 0.3 kg"),
+    ("task", {"q_min": (-0.2, -3.0), "payload": 0.002}, 5.0, "'joint1' stood at its lower limit"),
+    ("task", {"Kp": 5.0, "damping": 0.05}, 5.0, "still approaches"),
+    ("task", {"Kp": (0.0, 50.0), "control_period": 0.06}, 5.0, "unstable"),
+    ("joint", {**AWAY, **COARSE, "tau_ext": (0.03, 0.0)}, 5.0, "q_resolution"),
+    ("task", {"x_des": (0.297, 0.07), "Kp": 5.0}, 5.0, "still approaches"),
+    ("joint", {**AWAY, "control_period": 0.01, "q_resolution": 0.05}, 5.0, "does not see smaller errors"),
+    ("joint", {**AWAY, "Kd": 0.3, "control_period": 0.01}, 5.0, "damps Kp = 50 s⁻² too little"),
+    ("task", {"Kd": 1.5, "x_des": (0.4, 0.3)}, 5.0, "out of reach by 0.2 m"),
+    ("task", {"Kd": 1.5, "control_period": 0.06}, 5.0, "at its limit of stability"),
+    ("joint", {**AWAY, "Kp": 16.0, "Kd": 8.0, "control_period": 0.01, "control_delay": 0.08}, 5.0, "control_delay"),
+]
+
+
+@pytest.mark.parametrize(("control", "settings", "stop_time", "words"), FIRST, ids=[str(k) for k in range(len(FIRST))])
+def test_the_first_cause_is_the_one_without_which_the_error_is_smallest(
+    control: str, settings: dict[str, Any], stop_time: float, words: str
+) -> None:
+    assert words in verdict(control, stop_time, **settings).lines[0]
+
+
+def test_parts_of_loads_are_those_of_the_linear_balance(parts: list[dict[tuple[str, str], float]]) -> None:
+    """Under joint control e = Kp⁻¹ M⁻¹ Σ d, with d = Jᵀ m g of a payload, and minus an external effort."""
+    settings: dict[str, Any] = {**AWAY, "payload": 0.1, "tau_ext": (0.05, 0.02), "Kp": 400.0, "Kd": 40.0}
+    kept: list[twodof.Sample] = [*twodof.samples(fmu_of("arm", "joint"), settings=settings, stop_time=5.0)]
+    fmu = twodof.load_fmu(fmu_of("arm", "joint"))
+    model = pin.buildModelFromXML(fmu.urdf)
+    q, frame = np.array(kept[-1].q), model.getFrameId(fmu.frame)
+    data = model.createData()
+    M = pin.crba(model, data, q)
+    M = np.triu(M) + np.triu(M, 1).T
+    J = pin.computeFrameJacobian(model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3]
+    gravity = np.array([fmu.start_values[f"gravity[{i}]"] for i in (1, 2, 3)], float)
+    loads = {"payload": -J.T @ (0.1 * gravity), "tau_ext": -np.array([0.05, 0.02])}
+    terms = {name: np.linalg.solve(M, load) / 400.0 for name, load in loads.items()}
+    e = np.array(AWAY["q_des"]) - q
+    np.testing.assert_allclose(sum(terms.values()), e, rtol=1e-3)
+    verdict("joint", **settings)
+    for name, term in terms.items():
+        assert parts[-1]["load", name] == approx(term @ e / (e @ e), abs=2e-3)
+    assert sum(parts[-1].values()) == approx(1.0, abs=1e-9)
+
+
+def test_a_stuck_joint_has_the_part_that_the_controller_asks_of_it(parts: list[dict[tuple[str, str], float]]) -> None:
+    """The reaction of friction is M Kp e where gravity is known and nothing moves."""
+    made = verdict("joint", q_des=(0.5, 0.36), friction=(5.0, 5.0))
+    assert parts[-1]["friction", "joint1"] + parts[-1]["friction", "joint2"] == approx(1.0, abs=1e-6)
+    assert made.causes[0].part == approx(1.0, abs=1e-6)
+
+
+def test_small_causes_are_not_named_and_others_with_their_parts() -> None:
+    lines = str(verdict("joint", **AWAY, payload=0.05, tau_ext=(0.06, 0.0)))
+    assert lines.count("% of the error)") == 2
+    assert "payload" not in str(verdict("joint", **AWAY, payload=1e-5, tau_ext=(0.06, 0.0)).lines[:2])
+
+
+def test_a_run_of_unknown_forces_has_its_causes_by_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twodof.simulation.balance.parts_of_error", lambda *_: {})
+    found = verdict("joint", **AWAY, payload=0.3).causes
+    assert [cause.kind for cause in found] == ["load"] and found[0].part is None
+
+
+@pytest.mark.parametrize("name", ["gravity", "armature", "payload_com"])
+def test_a_parameter_that_the_controller_of_a_system_has_otherwise_is_named(name: str, tmp_path: Path) -> None:
+    system = twodof.build_fmu(tmp_path / "arm.ssp", twodof.FmuOptions(native=True, part="split"))
+    values = {"gravity": (0.0, 0.0, 0.0), "armature": (0.5, 0.5), "payload_com": (0.2, 0.0, 0.0)}[name]
+    more = {"plant.payload": 0.3, "controller.payload": 0.3, "controller.payload_known": True}
+    settings = {f"plant.{name}": values, **(more if name == "payload_com" else {})}
+    line = twodof.simulate(system, settings=settings).verdict.lines[0]
+    assert f"the controller's model has {name} = " in line and f"set controller.{name}" in line
+
+
+@pytest.mark.parametrize("recovered", [False, True])
+def test_an_input_that_changed_late_is_named(recovered: bool, tmp_path: Path) -> None:
+    """Also in a bag without a stored verdict."""
+    changes = [(1.0, {"tau_ext[1]": 1.0}), (4.8, {"tau_ext[1]": 0.0})]
+    bag = twodof.Bag(tmp_path / "bag")
+    made = twodof.simulate(fmu_of("arm", "joint"), bag, settings={**LARGE_STEPS, **AWAY}, changes=changes).verdict
+    if recovered:
+        run = twodof.read_bag(tmp_path / "bag")
+        made = run._judged(run.setup, run.x, run.target if run.x.size else run.x)
+    assert "tau_ext[1] changed from 1 to 0 at 4.8 s" in made.lines[0]
+
+
+def test_a_gain_that_changed_is_the_present_one_in_a_bag_without_a_verdict(tmp_path: Path) -> None:
+    twodof.simulate(
+        fmu_of("arm", "joint"), twodof.Bag(tmp_path / "bag"), settings={**LARGE_STEPS, **AWAY},
+        changes=[(0.2, {"Kp[1]": 0.0, "Kp[2]": 0.0})],
+    )  # fmt: skip
+    run = twodof.read_bag(tmp_path / "bag")
+    assert "Kp = 0: the controller" in run._judged(run.setup, run.x, run.target if run.x.size else run.x).lines[0]
+
+
+def test_a_joint_without_limits_may_turn_further_than_once() -> None:
+    unbounded = 1.7976931348623157e308
+    free: dict[str, Any] = {"q_min": (-unbounded, -3.0), "q_max": (unbounded, 3.0)}
+    assert not verdict("joint", q_des=(7.0, 0.8), **free).causes
+    assert "90°?" in verdict("joint", 20.0, q_des=(90.0, 0.8), **free).lines[0]

@@ -1,0 +1,32 @@
+"""Errors of one output of a run from its target, in constant memory."""
+
+from math import inf, nan
+
+import numpy as np
+
+from .setup import Array
+
+BAND = 0.02
+"""Band of the settling time, as a fraction of the initial error."""
+SMALLEST_MOVE = 1e-9  # m: a smaller move counts as a start at the target, without a settling time
+
+
+class Aim:
+    """Errors of one output from its target: position, orientation or joints."""
+
+    def __init__(self) -> None:
+        self.squares = 0.0
+        self.began, self.outside, self.first, self.last, self.past = 0.0, -inf, nan, nan, 0.0
+        self.way: Array = np.empty(0)
+
+    def begin(self, t: float, e: Array, size: float) -> None:
+        """Start a move to a new target, from an error vector (empty for an angle) and its magnitude."""
+        self.began, self.outside, self.first, self.last, self.past, self.way = t, t, size, size, 0.0, e
+
+    def add(self, t: Array, e: Array, size: Array) -> None:
+        """Add N samples of the move."""
+        if size.max() > BAND * self.first:
+            self.outside = t[np.flatnonzero(size > BAND * self.first)[-1]]
+        if self.way.size and self.first >= SMALLEST_MOVE:
+            self.past = max(self.past, -float((e @ self.way).min()) / self.first**2)
+        self.last = float(size[-1])

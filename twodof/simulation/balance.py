@@ -1,0 +1,217 @@
+"""Parts that forces and the motion have in an error, from the equations of the controlled robot.
+
+    M q̈_cmd + h_known − s = τ,    q̈_cmd = J⁺ (a − J̇ v + Kn J v) − Kn v,    a = Kp e + Kd (ẋ_des − J v) + ẍ_des
+    id(q̈) = τ + tau_ext + Jᵀ f_ext − D v + r
+
+id is the inverse dynamics of the robot with its payload, id_known that of the controller's model, s the effort by which
+a motor falls short, and r the reactions of friction and of stops. Without τ, and solved for e, there is one term for
+each force and one for the motion:
+
+    e = Kp⁻¹ ((J q̈ + J̇ v + Kd J v) − Kd ẋ_des − ẍ_des + (I − J J⁺) (a − J̇ v)
+              + J M⁻¹ (id(q̈) − id_known(q̈) − tau_ext − Jᵀ f_ext + D v − r + s))
+
+Under joint control J is the identity and J̇ is 0. The part of a term c in the error is c·e / e·e; all parts add up to 1.
+Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 8.5.2 and 8.6.2.
+"""
+
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, pairwise
+from typing import Any
+
+import numpy as np
+
+from ..plant.mechanism import Mechanism
+from ..plant.orientation import rotation_error
+from ..plant.robot import Robot, load_robot
+from ..plant.urdf import RobotError
+from ..plant.variables import EXACT
+from .controller_causes import PERIODS, controller_prefix, payloads
+from .judge import AT_LIMIT, Judge
+from .setup import Array
+
+CLOSED = 0.1  # part of the error that may remain without a cause
+HOLDING = 1.001  # reaction of friction at rest relative to its bound, beyond rounding
+LOOKED_AT = 9  # samples of the last quarter
+PARAMETERS = ("gravity", "armature", "payload", "payload_com")  # of plant and controller
+LAWS = {
+    "x": ("Kp", "Kd", "xd_des", "xdd_des"),
+    "quat": ("Kp_rot", "Kd_rot", "omega_des", "alpha_des"),
+    "q": ("Kp", "Kd", "v_des", "a_des"),
+}
+Key = tuple[str, str]
+"""A kind of cause, or "motion", and the joint or the input concerned, or ""."""
+
+
+def parts_of_error(judge: Judge, missed: Sequence[str]) -> Mapping[Key, float]:
+    """Return the part that each cause has in the errors of the missed outputs late in the run, the mean of the outputs.
+
+    The result is empty if the equations of the robot are unknown, or if more than CLOSED remains without a cause.
+    """
+    setup, gravity = judge.setup, judge.given("gravity")
+    if not missed or setup.robot is None or len(judge.end("tau")) != len(setup.joints) or len(gravity) != 3:
+        return {}
+    try:
+        text = ET.tostring(setup.robot.tree, encoding="unicode")
+        robot = load_robot(text, setup.frame, setup.axes or "xyz")
+    except RobotError:
+        return {}
+    if robot.joints != setup.joints or any(not len(judge.given(LAWS[name][0])) for name in judge.aims):
+        return {}
+    models = _models(judge, robot)
+    owner = [name for name in judge.aims for _ in judge.given(LAWS[name][0])]
+    rows = {name: np.array([of == name for of in owner]) for name in missed}
+    wholes, parts = dict.fromkeys(missed, 0.0), {name: defaultdict[Key, float](float) for name in missed}
+    for sample in _late(judge):
+        balance = _Balance(judge, models, *sample)
+        terms = [*balance.terms()]
+        for name, own in rows.items():
+            wholes[name] += float(balance.e[own] @ balance.e[own])
+            for key, term in terms:
+                parts[name][key] += float(term[own] @ balance.e[own])
+    if not all(wholes.values()):
+        return {}
+    mean = defaultdict[Key, float](float)
+    for name, own_parts in parts.items():
+        for key, part in own_parts.items():
+            mean[key] += part / wholes[name] / len(missed)
+    return mean if abs(1.0 - sum(mean.values())) <= CLOSED else {}
+
+
+def _models(judge: Judge, robot: Robot) -> dict[str, Mechanism]:
+    """Return the plant's model under "", and models in which each parameter after the other is the controller's."""
+    own = controller_prefix(judge)
+    payload, believed = payloads(judge)
+    values: dict[str, Any] = {name: judge.given(name) for name in ("gravity", "payload_com", "armature")}
+    values["payload"] = payload
+    known = {name: judge.given(own + name) if own else values[name] for name in values}
+    known["payload"] = believed
+    models = {}
+    for changed in ("", *PARAMETERS):
+        if changed:
+            values[changed] = known[changed]
+        models[changed] = Mechanism(
+            robot, values["gravity"], values["payload"], values["payload_com"], values["armature"]
+        )
+    return models
+
+
+def _late(judge: Judge) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield q, v and τ at samples of the last quarter of the run and of the time since the last change of a target."""
+    q, v, tau = (judge.history(name) for name in ("q", "v", "tau"))
+    since = int(np.searchsorted(judge.history(), max(judge.changed, 0.75 * judge.duration)))
+    yield judge.end("q"), judge.end("v"), judge.end("tau")
+    for k in np.linspace(min(since + 1, len(q)), len(q), LOOKED_AT - 1, endpoint=False).astype(int):
+        if k < len(q):
+            yield q[k], v[k], tau[k]
+
+
+class _Balance:
+    """The balance of forces at one sample.
+
+    Attributes:
+        e: errors of all outputs with a target, m and rad.
+    """
+
+    def __init__(self, judge: Judge, models: Mapping[str, Mechanism], q: Array, v: Array, tau: Array) -> None:
+        self._judge, self._models, self._known = judge, models, models[PARAMETERS[-1]]
+        self._q, self._v, self._tau = q, v, tau
+        known = self._known
+        x, rows, drift = (np.array(each) for each in known.observe(q, v))
+        axes, errors, gains = [], [], []
+        for name in judge.aims:
+            axes += {"x": judge.setup.rows, "quat": [3, 4, 5]}.get(name, [])
+            wanted = judge.wanted(name)
+            errors.append(
+                rotation_error(wanted.tolist(), known.rotation)
+                if name == "quat"
+                else wanted - (q if name == "q" else x[judge.setup.rows])
+            )
+            gains.append([judge.given(group) for group in LAWS[name]])
+        self.e = np.concatenate(errors)
+        self._Kp, self._Kd, self._xd, self._xdd = (np.concatenate(column) for column in zip(*gains))
+        self._force = rows[:3]
+        self._J = rows[axes] if axes else np.eye(len(q))
+        self._drift = drift[axes] if axes else np.zeros(len(q))
+
+    def terms(self) -> Iterator[tuple[Key, Array]]:
+        """Yield the terms of e, m and rad, with their causes."""
+        judge, J, v, Kp, Kd = self._judge, self._J, self._v, self._Kp, self._Kd
+        inverse = np.divide(1.0, Kp, out=np.zeros(len(Kp)), where=Kp > 0.0)
+        a, reaction = self._motion()
+        yield ("gain", ""), np.where(Kp > 0.0, 0.0, self.e)
+        rate, Kn = J @ v, float(judge.held.get("Kn", 0.0))
+        yield ("motion", ""), inverse * (J @ a + self._drift + Kd * rate)
+        yield from self._feedforward(inverse)
+        wanted = Kp * self.e + Kd * (self._xd - rate) + self._xdd - self._drift
+        pseudo = np.linalg.pinv(J, float(judge.setup.starts.get("rcond", 0.0)))
+        yield ("singularity", ""), inverse * (wanted - J @ (pseudo @ wanted))
+        command = pseudo @ (wanted + Kn * rate) - Kn * v
+        to_error = inverse[:, None] * (J @ np.linalg.inv(self._known.mass_matrix(self._q)))
+        for key, effort in chain(self._loads(a), self._reactions(reaction), self._shortages(command)):
+            yield key, to_error @ effort
+
+    def _feedforward(self, inverse: Array) -> Iterator[tuple[Key, Array]]:
+        first = 0
+        for name in self._judge.aims:
+            _, _, velocity, acceleration = LAWS[name]
+            own = np.zeros(len(self.e))
+            own[first : first + len(self._judge.given(velocity))] = 1.0
+            yield ("feedforward", velocity), -inverse * own * self._Kd * self._xd
+            yield ("feedforward", acceleration), -inverse * own * self._xdd
+            first += len(self._judge.given(velocity))
+
+    def _external(self) -> dict[str, Array]:
+        given = self._judge.given
+        forces = {"tau_ext": given("tau_ext"), "f_ext": self._force.T @ given("f_ext")}
+        return {**forces, "damping": -given("damping") * self._v}
+
+    def _motion(self) -> tuple[Array, Array]:
+        """Return accelerations, rad/s² or m/s², and reactions of stops and friction, N·m or N.
+
+        A joint at a stop, and one at rest with friction, does not accelerate, unless that needs a stop that pulls or
+        more than the friction.
+        """
+        setup, real, v = self._judge.setup, self._models[""], self._v
+        friction = self._judge.given("friction")
+        low, high = (np.abs(self._q - bound) <= AT_LIMIT for bound in (setup.low, setup.high))
+        M = real.mass_matrix(self._q)
+        effort = self._tau + sum(self._external().values()) - real.inverse_dynamics(self._q, v, np.zeros(len(v)))
+        effort -= friction * np.sign(v)
+        held = (v == 0.0) & (low | high | (friction > 0.0))
+        for _ in setup.joints:
+            a, free = np.zeros(len(v)), np.flatnonzero(~held)
+            a[free] = np.linalg.solve(M[np.ix_(free, free)], effort[free])
+            reaction = M @ a - effort
+            pulls = held & ((reaction < -HOLDING * friction) & ~high | (reaction > HOLDING * friction) & ~low)
+            if not pulls.any():
+                break
+            held &= ~pulls
+        return a, np.where(held, reaction, -friction * np.sign(v))
+
+    def _loads(self, a: Array) -> Iterator[tuple[Key, Array]]:
+        """Yield efforts that the controller does not know, N·m or N."""
+        needed = {name: model.inverse_dynamics(self._q, self._v, a) for name, model in self._models.items()}
+        for before, name in pairwise(needed):
+            yield ("load", name), needed[before] - needed[name]
+        for name, effort in self._external().items():
+            yield ("load", name), -effort
+
+    def _reactions(self, reaction: Array) -> Iterator[tuple[Key, Array]]:
+        setup = self._judge.setup
+        at_low, at_high = (np.abs(self._q - bound) <= AT_LIMIT for bound in (setup.low, setup.high))
+        stops = at_low & (reaction > 0.0) | at_high & (reaction < 0.0)
+        for joint, stop, own in zip(setup.joints, stops, -np.diag(reaction)):
+            yield ("limit" if stop else "friction", joint), own
+
+    def _shortages(self, command: Array) -> Iterator[tuple[Key, Array]]:
+        """Yield the differences between the efforts of the law and those that are applied, N·m or N."""
+        setup, tau = self._judge.setup, self._tau
+        saturated = np.abs(tau) >= np.array(setup.limits.effort) * (1.0 - EXACT)
+        saturated &= bool(self._judge.held.get("limit_effort"))
+        sampled = any(setup.starts.get(name) for name in PERIODS)
+        short = np.diag(self._known.inverse_dynamics(self._q, self._v, command) - tau)
+        for i, joint in enumerate(setup.joints):
+            if saturated[i] or sampled:
+                yield ("saturation", joint) if saturated[i] else ("sampling", ""), short[i]
