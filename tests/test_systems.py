@@ -195,22 +195,22 @@ def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp
         np.testing.assert_array_equal(q_of(path), expected)
 
 
-def nested(plant: bytes, pd: bytes, path: Path, factor: float = 2.0) -> Path:
+def nested(plant: bytes, pd: bytes, path: Path, top_values: str = "", inner_values: str = "") -> Path:
     """Write a system whose controller is two systems deep, with a gain and an offset before its target."""
     kinds = {"q": "input", "v": "input", "goal": "input deg", "tau": "output"}
     ports = connectors({f"{name}[{i}]": kind for i in (1, 2) for name, kind in kinds.items()})
     down = [(f"{n}[{i}]", f"{{}}.{n}[{i}]") for i in (1, 2) for n in ("q", "v")]
     up = [(f"{{}}.tau[{i}]", f"tau[{i}]") for i in (1, 2)]
-    scaled = f'<ssc:LinearTransformation factor="{factor}" offset="0.1"/>'
+    scaled = '<ssc:LinearTransformation factor="2" offset="0.1"/>'
     wires = {
         name: "".join(connection(a.format(name), b.format(name)) for a, b in down + up) for name in ("pd", "inner")
     }
     wires["pd"] += "".join(connection(f"goal[{i}]", f"pd.q_des[{i}]", scaled) for i in (1, 2))
     wires["inner"] += "".join(connection(f"goal[{i}]", f"inner.goal[{i}]") for i in (1, 2))
     inner, body = component("pd"), ""
-    for name, own in (("inner", "pd"), ("outer", "inner")):
+    for name, own, given in (("inner", "pd", inner_values), ("outer", "inner", "")):
         body = (
-            f'<ssd:System name="{name}">{ports}<ssd:Elements>{inner}</ssd:Elements>'
+            f'<ssd:System name="{name}">{ports}{given}<ssd:Elements>{inner}</ssd:Elements>'
             f"<ssd:Connections>{wires[own]}</ssd:Connections></ssd:System>"
         )
         inner = body
@@ -221,7 +221,7 @@ def nested(plant: bytes, pd: bytes, path: Path, factor: float = 2.0) -> Path:
     )
     system = (
         connectors({f"goal[{i}]": "input deg" for i in (1, 2)})
-        + f"<ssd:Elements>{component('plant')}{body}</ssd:Elements><ssd:Connections>{top}</ssd:Connections>"
+        + f"{top_values}<ssd:Elements>{component('plant')}{body}</ssd:Elements><ssd:Connections>{top}</ssd:Connections>"
     )
     return loop(path, plant, pd, ssd(system, units))
 
@@ -241,6 +241,27 @@ def test_nested_systems_are_flattened_and_transformations_come_after_units(
     first = next(run)
     moved = run.send({"goal": 90.0})
     assert (first.inputs["goal[1]"], moved.inputs["goal[1]"]) == (0.0, 90.0)
+
+
+def test_a_connector_without_a_value_passes_none(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """The connected variables keep their own values, or have those of an inner connector."""
+    wires = {"K": ("Kp", "Kd"), "goal": ("q_des[1]", "q_des[2]")}
+    wired = WIRES + "".join(connection(start, f"pd.{end}") for start, ends in wires.items() for end in ends)
+    ports = connectors({"K": "parameter", "goal": "input"})
+    parts = BOTH.replace(component("pd"), component("pd", binding(GIVEN)))
+    text = ssd(f"{ports}{parts}<ssd:Connections>{wired}</ssd:Connections>")
+    system, expected = loop(tmp_path / "loop.ssp", plant, pd, text), by_hand(plant, tmp_path / "plant.fmu")
+    assert not {"K", "goal"} & {*twodof.load_fmu(system).start_values}
+    np.testing.assert_array_equal(q_of(system), expected)
+    gains = {"outer__inner__pd__Kp": 0.1, "outer__inner__pd__Kd": 0.01}
+    goals = np.rad2deg((TARGET - 0.1) / 2.0)
+    right, wrong = (
+        binding(values(*(f"goal[{i + 1}] Real {x!r}" for i, x in enumerate(g.tolist())))) for g in (goals, -goals)
+    )
+    for given in ({"inner_values": right}, {"top_values": right, "inner_values": wrong}):
+        system = nested(plant, pd, tmp_path / "nested.ssp", **given)
+        np.testing.assert_allclose(twodof.load_fmu(system).start_values["goal[1]"], goals[0], rtol=1e-12)
+        np.testing.assert_allclose(q_of(system, **gains), expected, rtol=0, atol=1e-12)
 
 
 def test_values_come_from_sets_and_mappings_the_outermost_last(plant: bytes, pd: bytes, tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ class System(Fmu):
         batches: outputs and inputs in the order of evaluation at one instant.
         recorded: name of the component that is the robot.
         places: the component's variable, or the system's connector, for each of ``variables``.
-        bound: start values of components' variables from parameter bindings.
+        bound: start values of components' variables from parameter bindings, also of connectors that pass them.
     """
 
     title: str = ""
@@ -186,14 +186,18 @@ def _measuring(fmus: Mapping[str, Fmu], links: list[Link], robot: str) -> str:
 
 
 def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
-    """Return start values from parameter bindings; outer systems take precedence over inner ones."""
+    """Return start values from parameter bindings; outer systems take precedence over inner ones.
+
+    A connector with a value passes it to the connected variables; without one, they keep their own.
+    """
     starts: dict[Node, float | bool] = {}
     for element in wiring.elements.values():
         for parameter in element.parameters:
             node = wiring.find(f"{element.name}.{parameter.name}" if element.name else parameter.name)
             if node is not None:  # by the standard, other parameters are ignored
                 starts[node] = _value(path, wiring, node, parameter)
-    return starts
+    passed = wiring.passed(starts).items()
+    return starts | {node: _typed(path, node, wiring.scalar(node), value) for node, value in passed}
 
 
 def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> float | bool:
@@ -203,14 +207,17 @@ def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> floa
         raise FmuError(f"'{path}': the value of '{node}', '{value:.80}', is text or an enumeration: not supported")
     if parameter.converts:
         total = total.after(wiring.conversion(parameter.unit, wiring.unit(node), f"'{node}' and its value"))
-    kind = "Real" if scalar is None else scalar.type
-    truth = isinstance(value, bool)
-    result = value if truth else total.of(value)
+    return _typed(path, node, scalar, value if isinstance(value, bool) else total.of(value))
+
+
+def _typed(path: Path, node: Node, scalar: Scalar | None, value: float | bool) -> float | bool:
+    """Return a value for a variable, None for a connector, if it has the variable's type."""
+    kind, truth = "Real" if scalar is None else scalar.type, isinstance(value, bool)
     if scalar is not None and (truth != (kind == "Boolean") or kind not in NUMBERS):
         raise FmuError(f"'{path}': the value of '{node}', {value}, is not of type {kind}")
-    if not math.isfinite(result) or (kind == "Integer" and result != int(result)):
-        raise FmuError(f"'{path}': the value of '{node}', {result}, is not finite, or no whole number")
-    return int(result) if kind == "Integer" else result
+    if not math.isfinite(value) or (kind == "Integer" and value != int(value)):
+        raise FmuError(f"'{path}': the value of '{node}', {value}, is not finite, or no whole number")
+    return int(value) if kind == "Integer" else value
 
 
 def _variables(
@@ -243,10 +250,12 @@ def _variables(
         if source.element in fmus:
             continue
         scalars = [scalar for link in targets if (scalar := wiring.scalar(link.target)) is not None]
-        first, link = scalars[0], targets[0]
+        first = scalars[0]
         causality = "input" if any(scalar.causality == "input" for scalar in scalars) else "parameter"
-        default = starts.get(link.target, first.start_value)
-        start = starts.get(source, default if default is None else link.map.inverse(default))
+        values = [starts.get(link.target, scalar.start_value) for link, scalar in zip(targets, scalars)]
+        inverted = {value if value is None else link.map.inverse(value) for link, value in zip(targets, values)}
+        start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
+        start = start if start is None else _typed(path, source, first, start)
         add(str(source), source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
     ends = {link.target for link in links}
     names = Counter(name for fmu in fmus.values() for name in fmu.variables)

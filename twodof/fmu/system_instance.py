@@ -48,8 +48,7 @@ class SystemInstance:
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
         """Set start values, and enter and exit initialisation mode, for all FMUs together."""
-        every = {name: self._system.start_values[name] for name in self._outer_names()}
-        own = self._by_component({**every, **values})
+        own = self._by_component(values)
         for name, instance in self._instances.items():
             bound = {node.connector: v for node, v in self._system.bound.items() if node.element == name}
             with _named(name):
@@ -59,10 +58,6 @@ class SystemInstance:
             with _named(name):
                 instance.start()
         self._propagate()
-
-    def _outer_names(self) -> list[str]:
-        starts = self._system.start_values
-        return [name for name, node in self._system.places.items() if node in self._outer and name in starts]
 
     def reset(self) -> None:
         """Reset to the state after instantiation."""

@@ -49,6 +49,7 @@ class Wiring:
                 if own in fmu.variables:
                     self._check_connector(Node(name, own), connector, fmu.variables[own])
         self._incoming: dict[Node, tuple[Node, bool, Affine]] = {}
+        self._ways: list[list[Node]] = []  # from components' variables back to their first sources
         for element in self.elements.values():
             for connection in element.connections:
                 self._connect(element, connection)
@@ -138,7 +139,7 @@ class Wiring:
         Raises:
             FmuError: connections form a loop without a component, or connect different types or units.
         """
-        ways, room = [], MAX_WIRING
+        room = MAX_WIRING
         for target in self._incoming:
             if target.element not in self._fmus:
                 continue
@@ -151,8 +152,18 @@ class Wiring:
                 if way[-1].element in self._fmus:
                     break
             room = _spent(self._path, room, len(way))
-            ways.append(way)
-        return [Link(way[-1], way[0], self._map(way[::-1])) for way in ways]
+            self._ways.append(way)
+        return [Link(way[-1], way[0], self._map(way[::-1])) for way in self._ways]
+
+    def passed(self, starts: Mapping[Node, float | bool]) -> dict[Node, float | bool]:
+        """Return the values that connectors of systems pass to components' variables; the outermost value counts."""
+        values = {}
+        for way in self._ways:
+            valued = [k for k, node in enumerate(way) if node in starts and node.element not in self._fmus]
+            if valued:
+                last = valued[-1]
+                values[way[0]] = self._map(way[last::-1]).of(starts[way[last]])
+        return values
 
     def _map(self, way: list[Node]) -> Affine:
         """Return the map of values along a path of connections, with conversions of units."""
