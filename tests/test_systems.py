@@ -272,14 +272,14 @@ def test_values_come_from_sets_and_mappings_the_outermost_last(plant: bytes, pd:
     mapped = "".join(
         f'<ssm:MappingEntry source="{source}" target="{target}">{inside}</ssm:MappingEntry>'
         for source, target, inside in (
-            ("goal1", "pd.q_des[1]", ""),
-            ("goal2", "pd.q_des[2]", ""),
-            ("half", "pd.Kp", '<ssc:LinearTransformation factor="2"/>'),
+            ("my.goal1", "pd.q_des[1]", ""),
+            ("my.goal2", "pd.q_des[2]", ""),
+            ("my.half", "pd.Kp", '<ssc:LinearTransformation factor="2"/>'),
         )
     )
     ssm = f'<ssm:ParameterMapping {NAMESPACES} version="1.0">{mapped}</ssm:ParameterMapping>'
     outer = binding(
-        mapping='<ssd:ParameterMapping source="maps/map.ssm"/>', attributes='source="sets/my%20set.ssv" prefix=""'
+        mapping='<ssd:ParameterMapping source="maps/map.ssm"/>', attributes='source="sets/my%20set.ssv" prefix="my."'
     )
     own = values("Kp Real 77", "Kd Real 0.01", "unknown Real 1")
     elements = f"<ssd:Elements>{component('plant')}{component('pd', binding(own))}</ssd:Elements>"

@@ -232,8 +232,7 @@ class _File:
         self._check_once([e.get("target", "") for e in entries], f"a mapping of '{name or 'the system'}' sets")
         for entry in entries:
             source, target = entry.get("source", ""), entry.get("target", "")
-            if prefix + source in given:
-                parameter = given[prefix + source]
+            if (parameter := given.get(source)) is not None:  # the source has the prefix
                 converts = entry.get("suppressUnitConversion") not in TRUE
                 what = f"'{self._path}': the mapping of '{source}'"
                 yield parameter._replace(name=target, converts=converts, map=transformation(entry, what))
