@@ -21,8 +21,10 @@ NAMESPACES = " ".join(
 )
 
 
-def pd_fmu(feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: float = 1.0) -> bytes:
-    """Return the FMU of native/pd.c, with q in a given unit of angle."""
+def pd_fmu(
+    feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: float = 1.0, initial: str | None = None
+) -> bytes:
+    """Return the FMU of native/pd.c, with q in a given unit of angle and stated dependencies."""
     rows = [
         *(
             (f"{name}[{i + 1}]", 2 * k + i, "input", f'Real start="0.0" unit="{unit if k != 1 else "rad/s"}"')
@@ -46,7 +48,10 @@ def pd_fmu(feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: fl
         f' variability="{varies.get(causality, varies.get(kind.split()[0], "continuous"))}"><{kind}/></ScalarVariable>'
         for name, vr, causality, kind in rows
     )
-    outputs = "".join(f'<Unknown index="{i}" {feedthrough.format(f"{i - 6} {i - 4} {i - 2} 11 14")}/>' for i in (7, 8))
+    outputs, initially = (
+        "".join(f'<Unknown index="{i}" {stated.format(f"{i - 6} {i - 4} {i - 2} 11 14")}/>' for i in (7, 8))
+        for stated in (feedthrough, initial or "")
+    )
     xml = f"""<fmiModelDescription fmiVersion="2.0" modelName="pd" guid="pd">
 <CoSimulation modelIdentifier="pd"/>
 <UnitDefinitions><Unit name="{unit}"><BaseUnit rad="1" factor="{factor!r}"/></Unit>
@@ -56,7 +61,7 @@ def pd_fmu(feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: fl
 </TypeDefinitions>
 <ModelVariables>{variables}</ModelVariables>
 <ModelStructure><Outputs>{outputs}<Unknown index="12" dependencies=""/><Unknown index="13" dependencies="11"/>
-</Outputs></ModelStructure>
+</Outputs>{"" if initial is None else f"<InitialUnknowns>{initially}</InitialUnknowns>"}</ModelStructure>
 </fmiModelDescription>"""
     sources = {**standard_headers(), "pd.c": (HERE / "native/pd.c").read_bytes()}
     library = compile_library(sources, "linux64", "pd", units=["pd.c"], flags=["-fvisibility=default"])

@@ -7,7 +7,8 @@ import random
 import re
 import time
 from collections.abc import Iterator, Mapping
-from itertools import count
+from contextlib import closing
+from itertools import count, pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,7 +21,7 @@ from systems import NAMESPACES, WIRES, component, connection, connectors, loop, 
 
 import twodof
 from twodof.cli.main import main
-from twodof.errors import FmuError, InputError
+from twodof.errors import FmuError, InputError, SimulationError
 from twodof.fmu import ssp_file
 
 H, N = 0.01, 50
@@ -444,6 +445,32 @@ def test_an_algebraic_loop_is_named(plant: bytes, pd: bytes, tmp_path: Path) -> 
             twodof.load_fmu(loop(tmp_path / "loop.ssp", plant, controller, crossed()))
     delays = pd_fmu(feedthrough='dependencies=""')
     assert len(q_of(loop(tmp_path / "loop.ssp", plant, delays, crossed()))) == N + 1
+
+
+@pytest.mark.parametrize("initial", ['dependencies="{}"', "", None])
+def test_start_values_pass_in_the_order_of_initial_unknowns(plant: bytes, tmp_path: Path, initial: str | None) -> None:
+    """Outputs that depend on inputs only at the start, three in a row, are right at the start, stated or not."""
+    row = ["pd", "twin", "third"]
+    parts = "".join(component("pd").replace('name="pd"', f'name="{name}"') for name in row[::-1])
+    wires = connection("plant.q[1]", "pd.q[1]") + connection("third.tau[1]", "plant.tau_cmd[1]")
+    free = 'suppressUnitConversion="true"'
+    wires += "".join(connection(f"{a}.tau[1]", f"{b}.q[1]", more=free) for a, b in pairwise(row))
+    text = f"<ssd:Elements>{parts}{component('plant')}</ssd:Elements><ssd:Connections>{wires}</ssd:Connections>"
+    system = loop(tmp_path / "loop.ssp", plant, pd_fmu('dependencies=""', initial=initial), ssd(text))
+    run = twodof.experiment(system, signals=True, settings={f"{name}.Kp": 2.0 for name in row} | {"q_start": 0.5})
+    with closing(twodof.samples(run)) as samples:
+        first = dict(zip(run.signals, next(samples).signals))
+    assert [first["pd.tau[1]"], first["twin.tau[1]"], first["third.tau[1]"], first["tau[1]"]] == [-1.0, 2.0, -4.0, -4.0]
+
+
+def test_an_algebraic_loop_at_the_start_is_refused(plant: bytes, tmp_path: Path) -> None:
+    stated = pd_fmu('dependencies=""', initial='dependencies="{}"')
+    way = r"(?=.*pd\.q\[1\] -> pd\.tau\[1\])(?=.*twin\.q\[1\] -> twin\.tau\[1\])"
+    with pytest.raises(FmuError, match=f"algebraic loop at its start: {way}"):
+        twodof.load_fmu(loop(tmp_path / "loop.ssp", plant, stated, crossed()))
+    unstated = loop(tmp_path / "loop.ssp", plant, pd_fmu('dependencies=""', initial=""), crossed())
+    with pytest.raises(SimulationError, match=r"'(pd|twin)\.tau\[1\]' changes with each evaluation in initialis"):
+        q_of(unstated, pd__Kp=1.0, pd__q_des=0.3)
 
 
 def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:

@@ -34,6 +34,7 @@ class System(Fmu):
         components: FMUs by full name.
         links: connections of components' variables with their first sources.
         batches: outputs and inputs in the order of evaluation at one instant.
+        initial: the same in initialisation mode.
         recorded: name of the component that is the robot.
         places: the component's variable, or the system's connector, for each of ``variables``.
         bound: start values of components' variables from parameter bindings, also of connectors that pass them.
@@ -45,6 +46,7 @@ class System(Fmu):
     components: Mapping[str, Fmu] = field(default_factory=dict)
     links: tuple[Link, ...] = ()
     batches: tuple[tuple[Node, ...], ...] = ()
+    initial: tuple[tuple[Node, ...], ...] = ()
     places: Mapping[str, Node] = field(default_factory=dict)
     bound: Mapping[Node, float | bool] = field(default_factory=dict)
 
@@ -136,7 +138,7 @@ def load_system(path: Path, robot: str = "") -> System:
             raise FmuError(f"'{path}': its components have more than {most}")
     wiring = Wiring(path, top, fmus)
     links = wiring.links()
-    batches = order(path, fmus, links)
+    batches, initial = (tuple(map(tuple, order(path, fmus, links, start))) for start in (False, True))
     chosen = _robot(path, fmus, robot)
     starts = _bound(path, wiring)
     variables, places = _variables(path, wiring, fmus, links, starts, chosen, _measuring(fmus, links, chosen))
@@ -158,7 +160,8 @@ def load_system(path: Path, robot: str = "") -> System:
         digest=digest.hexdigest(),
         components=fmus,
         links=tuple(links),
-        batches=tuple(map(tuple, batches)),
+        batches=batches,
+        initial=initial,
         places=places,
         bound={node: value for node, value in starts.items() if node.element in fmus},
     )

@@ -2,6 +2,7 @@
 
     at each communication point t_k, in the order of direct feedthrough:
         outputs y(t_k) of each FMU; inputs u(t_k) = gain · y(t_k) + offset of the FMUs that they are connected to
+    at the first one, in initialisation mode, in the order of InitialUnknowns, and again until no output changes
     then each FMU steps from t_k to t_(k+1) with its inputs held
 
 Therefore direct feedthrough of an FMU adds no delay, and the order of the FMUs has no effect.
@@ -17,6 +18,7 @@ from itertools import groupby
 
 import fmpy
 
+from ..bounds import MAX_COMPONENTS
 from ..errors import FmuError, SimulationError
 from ..export.python_wrapper import check_python_wrapper
 from ..files import temporary_folder
@@ -26,6 +28,8 @@ from .ssp_file import IDENTITY
 from .system import System
 from .wiring import Link, Node
 
+Move = tuple[str, Callable[[], object]]
+"""A component, and a function that reads its outputs or sets its inputs."""
 READ = ("documentation/", "sources/")
 """Folders of an FMU that its library does not need."""
 
@@ -39,10 +43,9 @@ class SystemInstance:
         for link in system.links:
             if link.source.element not in instances:
                 self._outer.setdefault(link.source, []).append(link)
-        self._signals = (c_double * max(1, sum(map(len, system.batches))))()  # values of connected Real outputs
-        self._columns: dict[Node, int] = {}
         self._discrete: dict[Node, float | bool] = {}
-        self._moves = [move for batch in system.batches for move in self._moves_of(batch)]
+        self._moves, _ = self._in_order(system.batches)
+        self._initial, self._signals = self._in_order(system.initial)
         self._steps = [(name, instance.step) for name, instance in instances.items()]
         self._due = True
 
@@ -53,7 +56,7 @@ class SystemInstance:
             bound = {node.connector: v for node, v in self._system.bound.items() if node.element == name}
             with _named(name):
                 instance.begin(start_time, stop_time, {**bound, **own.get(name, {})})
-        self._propagate()
+        self._settle()
         for name, instance in self._instances.items():
             with _named(name):
                 instance.start()
@@ -109,6 +112,19 @@ class SystemInstance:
         self._due = False
         self._each(self._moves)
 
+    def _settle(self) -> None:
+        """Pass outputs to inputs in initialisation mode until none changes, because not all dependencies are stated."""
+        self._each(self._initial)
+        for _ in range(MAX_COMPONENTS):
+            before = {**self._signals(), **self._discrete}
+            self._each(self._initial)
+            after = {**self._signals(), **self._discrete}
+            changed = [node for node, value in after.items() if value != before[node] and value == value]
+            if not changed:
+                return
+        why = "it is in an algebraic loop, or has another value at each read; `twodof check` tries its FMU"
+        raise SimulationError(f"'{changed[0]}' changes with each evaluation in initialisation mode: {why}")
+
     def _each(self, calls: Sequence[tuple[str, Callable[..., object]]], *arguments: float) -> None:
         """Run functions in order; an error names the component."""
         name = ""
@@ -119,7 +135,13 @@ class SystemInstance:
         except SimulationError as error:
             raise SimulationError(f"'{name}': {error}", outcome=error.outcome) from error
 
-    def _moves_of(self, batch: Sequence[Node]) -> Iterator[tuple[str, Callable[[], object]]]:
+    def _in_order(self, batches: Sequence[Sequence[Node]]) -> tuple[list[Move], Callable[[], dict[Node, float]]]:
+        """Return functions that pass outputs to inputs in an order, and one that returns the latest Real outputs."""
+        signals, columns = (c_double * max(1, sum(map(len, batches))))(), dict[Node, int]()
+        moves = [move for batch in batches for move in self._moves_of(batch, signals, columns)]
+        return moves, lambda: dict(zip(columns, signals))
+
+    def _moves_of(self, batch: Sequence[Node], signals: Values, columns: dict[Node, int]) -> Iterator[Move]:
         """Yield components and functions that read a batch's outputs, or set inputs from earlier outputs."""
         incoming = {link.target: link for link in self._system.links}
         for element, instance in self._instances.items():
@@ -128,36 +150,38 @@ class SystemInstance:
             reals = [node for node in own if variables[node.connector].type == "Real"]
             sinks = [incoming[node] for node in reals if node in incoming]
             if sources := [node for node in reals if node not in incoming]:
-                first = len(self._columns)
-                self._columns |= {node: first + i for i, node in enumerate(sources)}
-                part = _part(self._signals, first, len(sources))
+                first = len(columns)
+                columns |= {node: first + i for i, node in enumerate(sources)}
+                part = _part(signals, first, len(sources))
                 yield element, instance.reader([node.connector for node in sources], part)
             if sinks:
-                yield element, self._writer(instance, sorted(sinks, key=lambda link: self._columns[link.source]))
+                rows = sorted((columns[link.source], link) for link in sinks)
+                yield element, _writer(instance, rows, signals)
             for node in (node for node in own if node not in reals):
                 move = self._set_one if node in incoming else self._read_one
                 yield element, partial(move, instance, node, incoming[node].source if node in incoming else node)
-
-    def _writer(self, instance: Instance, sinks: Sequence[Link]) -> Callable[[], None]:
-        """Return a function that sets inputs from signals; equal signals in order are not copied."""
-        names, columns = [link.target.connector for link in sinks], [self._columns[link.source] for link in sinks]
-        equal = all(link.map == IDENTITY for link in sinks)
-        if equal and columns == [*range(columns[0], columns[0] + len(columns))]:
-            return instance.writer(names, _part(self._signals, columns[0], len(columns)))
-        values, signals = (c_double * len(sinks))(), self._signals
-        write, rows = instance.writer(names, values), [(link.map, column) for link, column in zip(sinks, columns)]
-
-        def move() -> None:
-            values[:] = [affine.of(signals[column]) for affine, column in rows]
-            write()
-
-        return move
 
     def _read_one(self, instance: Instance, node: Node, _node: Node) -> None:
         self._discrete[node] = instance.value(node.connector)
 
     def _set_one(self, instance: Instance, node: Node, source: Node) -> None:
         instance.set({node.connector: self._discrete[source]})
+
+
+def _writer(instance: Instance, rows: Sequence[tuple[int, Link]], signals: Values) -> Callable[[], None]:
+    """Return a function that sets inputs from columns of signals; equal signals in order are not copied."""
+    names, first = [link.target.connector for _, link in rows], rows[0][0]
+    equal = all(link.map == IDENTITY for _, link in rows)
+    if equal and [column for column, _ in rows] == [*range(first, first + len(rows))]:
+        return instance.writer(names, _part(signals, first, len(rows)))
+    values = (c_double * len(rows))()
+    write, maps = instance.writer(names, values), [(link.map, column) for column, link in rows]
+
+    def move() -> None:
+        values[:] = [affine.of(signals[column]) for affine, column in maps]
+        write()
+
+    return move
 
 
 def _part(values: Values, first: int, size: int) -> Values:

@@ -230,11 +230,17 @@ def _spent(path: object, room: int, size: int) -> int:
     return room - size
 
 
-def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[list[Node]]:
+def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link], initial: bool = False) -> list[list[Node]]:
     """Return batches of outputs and inputs in the order of evaluation at one instant.
 
     An output follows the connected inputs on which it depends directly by its FMU's ModelStructure. Without stated
     dependencies, it follows all of them.
+
+    Args:
+        path: the system's file, for errors.
+        fmus: components by full name.
+        links: connections.
+        initial: whether the instant is in initialisation mode, in which InitialUnknowns take precedence.
 
     Raises:
         FmuError: there is an algebraic loop, which the message names.
@@ -244,9 +250,7 @@ def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[
     for link in between:
         name, own = link.target
         inputs[name].setdefault(fmus[name].variables[own].reference, []).append(link.target)
-    known = {
-        name: {u.variable.valueReference: u.dependencies for u in fmu.description.outputs} for name, fmu in fmus.items()
-    }
+    known = {name: _dependencies(fmu, initial) for name, fmu in fmus.items()}
     graph: dict[Node, list[Node]] = {link.target: [link.source] for link in between}
     needs: dict[tuple[str, int], list[Node]] = {}
     room = MAX_WIRING
@@ -254,8 +258,7 @@ def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[
         name, here = source.element, inputs[source.element]
         output = name, fmus[name].variables[source.connector].reference
         if output not in needs:
-            stated = known[name].get(output[1])
-            references = here if stated is None else dict.fromkeys(variable.valueReference for variable in stated)
+            references = known[name].get(output[1], here)
             needs[output] = [node for reference in references for node in here.get(reference, [])]
         graph[source] = needs[output]
         room = _spent(path, room, len(needs[output]))
@@ -265,8 +268,20 @@ def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link]) -> list[
     except CycleError as error:
         loop = " -> ".join(str(node) for node in error.args[1])
         remedy = "an FMU in it has to delay its output, as one with a control_period or a state does"
-        raise FmuError(f"'{path}' has an algebraic loop: {loop}; {remedy}") from error
+        if initial:
+            remedy = "an FMU in it needs an output whose start value depends on no input, by its InitialUnknowns"
+        raise FmuError(f"'{path}' has an algebraic loop{' at its start' * initial}: {loop}; {remedy}") from error
     while sorter.is_active():
         batches.append([*sorter.get_ready()])
         sorter.done(*batches[-1])
     return batches
+
+
+def _dependencies(fmu: Fmu, initial: bool) -> dict[int, list[int]]:
+    """Return the value references on which an FMU's unknowns depend directly, if its ModelStructure states them."""
+    unknowns = [*fmu.description.outputs, *(fmu.description.initialUnknowns if initial else ())]
+    return {
+        unknown.variable.valueReference: [*dict.fromkeys(variable.valueReference for variable in unknown.dependencies)]
+        for unknown in unknowns
+        if unknown.dependencies is not None
+    }
