@@ -117,6 +117,17 @@ def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
     assert not check.passed and len(check.rows) == 12
 
 
+def test_a_variable_with_an_alias_is_tried(tmp_path: Path) -> None:
+    """A local variable has the value reference of the output or of the input."""
+    for reference in (1, 4):
+        alias = f'<ScalarVariable name="same" valueReference="{reference}"><Real/></ScalarVariable></ModelVariables>'
+        described = DESCRIPTION.replace("</ModelVariables>", alias)
+        assert [*failed(twodof.check(foreign(tmp_path, "KEEPS", described)))] == ["reset"]
+        rows = {row.name: row.text for row in twodof.check(foreign(tmp_path, description=described)).rows}
+        assert rows["simulation"] == "20 steps of 0.01 s, 1 real outputs, all finite"
+        assert rows["inputs"].startswith("1 inputs;")
+
+
 def test_another_start_value_than_the_stated_one_fails(tmp_path: Path) -> None:
     described = DESCRIPTION.replace('variability="fixed"><Real start="1"/>', 'variability="fixed"><Real start="2"/>')
     texts = failed(twodof.check(foreign(tmp_path, description=described)))

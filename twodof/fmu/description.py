@@ -200,7 +200,7 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     fmu = Fmu(
         path=path,
         description=description,
-        variables={scalar.name: scalar for variable in description.modelVariables for scalar in _scalars(variable)},
+        variables={scalar.name: scalar for variable in description.modelVariables for scalar in scalars(variable)},
         members=members,
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
         **_vendor_annotation(root),
@@ -320,8 +320,8 @@ def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
     }
 
 
-def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
-    """Return a scalar variable itself, or the elements of an array."""
+def scalars(variable: ModelVariable) -> Iterator[Scalar]:
+    """Yield a scalar variable itself, or the elements of an array."""
     kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
     rest, text = (variable.causality, kind, variable.unit), variable.description or ""
     if not variable.dimensions:

@@ -9,7 +9,7 @@ from math import inf, isfinite
 from fmpy.model_description import ModelVariable
 
 from ..errors import SimulationError
-from .description import Fmu
+from .description import Fmu, scalars
 from .instance import Instance
 from .system_instance import instantiate_fmu
 
@@ -46,9 +46,8 @@ class Trial:
         )
         self.start = float(start or 0.0)
         self.step = float(step or (float(stop) - self.start if stop else 5.0) / 500)
-        described = {v.valueReference: v for v in self.about.modelVariables if v.type in ("Real", "Float64")}
         self.variables: dict[str, ModelVariable] = {
-            name: described[v.reference] for name, v in fmu.variables.items() if v.type == "Real"
+            scalar.name: v for v in self.about.modelVariables for scalar in scalars(v) if scalar.type == "Real"
         }
         self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
         self.others = [
