@@ -142,6 +142,12 @@ def test_a_sampled_controller_passes(part: Any, tmp_path: Path) -> None:
     assert not failed(check), str(check)
 
 
+def test_a_crash_at_a_forbidden_call_is_a_remark(tmp_path: Path) -> None:
+    row = twodof.check(foreign(tmp_path, "FRAGILE")).rows[-2]
+    text = "it ended its process at: a forbidden call, a read of a variable that does not exist: Aborted"
+    assert row == ("call order", "remark", text)
+
+
 def test_a_call_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checking, "MAX_CALL_WAIT", 2)
     texts = failed(twodof.check(foreign(tmp_path, "HANGS")))
@@ -168,7 +174,9 @@ def test_a_row_without_a_claimed_feature_does_not_apply(tmp_path: Path) -> None:
     for claim in ("canHandleVariableCommunicationStepSize", "canGetAndSetFMUstate", "canSerializeFMUstate"):
         described = described.replace(f'{claim}="true"', "")
     described = described.replace('providesDirectionalDerivative="true"', 'canBeInstantiatedOnlyOncePerProcess="true"')
-    rows = {row.name: row for row in twodof.check(foreign(tmp_path, description=described)).rows}
+    check = twodof.check(foreign(tmp_path, "ALONE", described))
+    assert check.passed, check
+    rows = {row.name: row for row in check.rows}
     left = {name: row.text for name, row in rows.items() if row.outcome == "does not apply"}
     assert left == {
         "two instances": "it states canBeInstantiatedOnlyOncePerProcess",

@@ -6,20 +6,20 @@
 #include "fmi2Functions.h"
 
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
-       READS_CHANGE, COUNTS, GREEDY };
+       READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE };
 typedef struct { double u, x, p; int phase; } M;
 static double shared;
-static int count;
+static int count, living;
 static void start(M *m) { *m = (M){0.0, 1.0, 1.0, 0}; }
 static double y_of(M *m) { return (FAULT == SHARES ? shared : m->x) + 2.0 * m->u; }
 
 fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
                               fmi2Boolean v, fmi2Boolean l) {
-    M *m = malloc(sizeof *m);
-    start(m);
+    M *m = FAULT == ALONE && living++ ? NULL : malloc(sizeof *m);
+    if (m) start(m);
     return m;
 }
-void fmi2FreeInstance(fmi2Component c) { free(c); }
+void fmi2FreeInstance(fmi2Component c) { living = 0; free(c); }
 fmi2Status fmi2Reset(fmi2Component c) {
     double x = ((M *)c)->x;
     if (FAULT == HANGS) for (;;) sleep(1);
@@ -40,6 +40,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
     M *m = c;
     for (size_t i = 0; i < n; i++) {
         double value[] = {0.0, m->u, m->x, m->u - m->x, FAULT == NOT_FINITE ? NAN : y_of(m), m->p};
+        if (r[i] > 5 && FAULT == FRAGILE) abort();
         if (r[i] > 5) return fmi2Error;
         if (FAULT == READS_CHANGE && r[i] == 4) m->x += 1e-3;
         v[i] = value[r[i]];

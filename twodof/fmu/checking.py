@@ -23,7 +23,7 @@ from .reference_runs import Reference, references_of
 from .ssp_file import STRUCTURE, read_ssp
 from .system import load_system
 from .trial import Trial, UnpassedError
-from .trials import TRIALS, reference_run
+from .trials import FORBIDDEN, TRIALS, reference_run
 
 MOST_PROBLEMS = 20  # of a description, in its row
 
@@ -153,7 +153,10 @@ def _runs(fmu: Fmu, tools: Sequence[str]) -> list[_Task]:
 
 
 def _tried(fmu: Fmu, tasks: Sequence[_Task]) -> Iterator[Row]:
-    """Yield the row of each trial; after a crash, a new process does the remaining trials."""
+    """Yield the row of each trial; after a crash, a new process does the remaining trials.
+
+    A crash at a call that the standard forbids is a remark, because the FMU need not detect it.
+    """
     waiting = [*tasks]
     while waiting:
         doing = "its start"
@@ -170,7 +173,8 @@ def _tried(fmu: Fmu, tasks: Sequence[_Task]) -> Iterator[Row]:
                         (doing,) = words
             except (EOFError, ValueError, TypeError) as end:  # an FMU can write what it likes
                 limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
-                yield Row(waiting.pop(0).name, "failed", f"it ended its process at: {doing}{limit}: {end}")
+                outcome = "remark" if doing.startswith(FORBIDDEN) else "failed"
+                yield Row(waiting.pop(0).name, outcome, f"it ended its process at: {doing}{limit}: {end}")
 
 
 def _serve(pipe: Connection, path: Path, inside: str, tasks: Sequence[_Task], folder: Path) -> None:

@@ -22,6 +22,7 @@ from .trial import DELTA, STEPS, Trial, UnpassedError
 
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 """Sizes of variable steps, as multiples of the default step."""
+FORBIDDEN = "a forbidden call"
 UNKNOWN = 2**31 - 9  # a value reference that no variable has
 Calls = dict[str, tuple[str, Callable[[Instance], object]]]
 
@@ -150,17 +151,16 @@ def call_order(trial: Trial) -> str:
     """Make calls that the standard forbids; an FMU need not detect them."""
     calls = _forbidden(trial)
     accepted = []
-    with trial.instance() as first:
-        for what, (phase, call) in calls.items():
-            trial.note(what)
-            instance = first.another()
+    for what, (phase, call) in calls.items():
+        trial.note("instantiation and initialisation")
+        with instantiate_fmu(trial.fmu) as instance:
             if phase != "new":
                 instance.initialise(trial.start, inf, {})
             if phase == "ended":
                 instance.slave.terminate()
+            trial.note(f"{FORBIDDEN}, {what}")
             if not instance.refuses(partial(call, instance)):
                 accepted.append(what)
-            instance.free()
     if accepted:
         raise UnpassedError("remark", f"it accepts {', '.join(accepted)}")
     return f"{len(calls)} calls that the standard forbids are refused"
