@@ -12,6 +12,7 @@ from pathlib import Path
 import fmpy
 import lxml.etree
 import pytest
+from systems import pd_fmu
 from tools import needs
 
 import twodof
@@ -207,3 +208,40 @@ def test_an_experiment_may_have_any_name_and_needs_results(built: Path, tmp_path
     found = rows(packed(files, tmp_path / "named.fmu"))
     assert found["reference push with fmpy"].outcome == "passed"
     assert found["reference move"].text == "its results have no values after its start"
+
+
+def with_references(fmu: bytes, files: dict[str, str], path: Path) -> Path:
+    """Write an FMU with files of references, the first of which has the experiments."""
+    related = "".join(
+        f'<Related source="{name}" role="{"other" if k else "experiment"}"'
+        f' checksum="{hashlib.sha3_256(text.encode()).hexdigest()}"/>'
+        for k, (name, text) in enumerate(files.items())
+    )
+    path.write_bytes(fmu)
+    texts = {**files, "fmi-ls-manifest.xml": f"<fmiReferences>{related}</fmiReferences>"}
+    return packed({**members(path), **{FOLDER + name: text.encode() for name, text in texts.items()}}, path)
+
+
+@pytest.mark.parametrize("tool", ["fmpy", "libcosim"])
+def test_stimuli_and_results_may_be_truth_values_and_whole_numbers(tool: str, tmp_path: Path) -> None:
+    """A controller is disabled by a Boolean, and by a number of steps, after 5 of 10 steps."""
+    if tool == "libcosim":
+        needs("libcosimpy")
+        needs("libatomic")
+    values = '<Parameter name="enabled"><Boolean value="1"/></Parameter>'
+    stimuli = {"enabled": ("true", "false"), "seen": ("0", "30")}
+    experiments = "".join(
+        f'<Experiment name="{name}" startTime="0" stopTime="0.1" stepSize="0.01" tolerance="0">'
+        f'<Parameters source="{name}.ssv"/><Stimuli source="{name}.csv"/><References source="results.csv"/>'
+        "</Experiment>"
+        for name in stimuli
+    )
+    results = "".join(f"{0.01 * (k + 1)!r},{10.0 if k < 5 else 0.0},{k + 1}\n" for k in range(10))
+    files = {"e.exp": f"<Experiments>{experiments}</Experiments>"}
+    for name, (first, last) in stimuli.items():
+        own = "" if name == "enabled" else values
+        files[f"{name}.ssv"] = f'<S><Parameter name="q_des[1]"><Real value="1"/></Parameter>{own}</S>'
+        files[f"{name}.csv"] = f"time,{name}\n0,{first}\n0.04,{first}\n0.05,{last}\n"
+    files["results.csv"] = "time,tau[1],steps\n" + results
+    found = rows(with_references(pd_fmu(), files, tmp_path / "pd.fmu"), tool)
+    assert [(row.outcome, row.text[:9]) for row in found.values()] == [("passed", "20 values")] * 4, found

@@ -87,9 +87,17 @@ fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t
     return fmi2OK;
 }
 
+fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2String value[])
+{
+    (void)c, (void)vr;
+    for (size_t i = 0; i < n; i++)
+        value[i] = "";
+    return fmi2OK;
+}
+
 /* The calls that no importer makes: FMPy only loads a library that has them all. */
 #define NEVER(name) fmi2Status fmi2##name(void) { return fmi2Error; }
-NEVER(SetDebugLogging) NEVER(GetString) NEVER(SetString) NEVER(GetFMUstate)
+NEVER(SetDebugLogging) NEVER(SetString) NEVER(GetFMUstate)
 NEVER(SetFMUstate) NEVER(FreeFMUstate) NEVER(SerializedFMUstateSize) NEVER(SerializeFMUstate)
 NEVER(DeSerializeFMUstate) NEVER(GetDirectionalDerivative) NEVER(SetRealInputDerivatives)
 NEVER(GetRealOutputDerivatives) NEVER(CancelStep) NEVER(GetStatus) NEVER(GetRealStatus) NEVER(GetIntegerStatus)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from importlib.util import find_spec
 from math import inf
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, choice
 from .description import Fmu
-from .reference_runs import Reference, Values
+from .reference_runs import KINDS, Reference, Values
 from .system_instance import instantiate_fmu
 
 Rows = NDArray[np.float64]
@@ -24,14 +22,20 @@ def in_this_master(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows
     """Run the stimuli by this package's own calls."""
     with instantiate_fmu(fmu) as instance:
         instance.initialise(reference.start, inf, _starts(fmu, reference))
-        return reference.rows(instance.set, instance.step, instance.reader(names))
+        reals = [name for name in names if fmu.variables[name].type == "Real"]
+        read = instance.reader(reals)
+
+        def read_all() -> list[float]:
+            values = dict(zip(reals, read()))
+            return [values[name] if name in values else instance.value(name) for name in names]
+
+        return reference.rows(instance.set, instance.step, read_all)
 
 
 def _starts(fmu: Fmu, reference: Reference) -> Values:
     """Return the start values of a reference, each with its variable's type."""
-    kinds: dict[str, Callable[[Any], Any]] = {"Real": float, "Integer": int, "Boolean": bool}
     values = {**reference.parameters, **reference.inputs(0)}
-    return {name: kinds[fmu.variables[name].type](value) for name, value in values.items()}
+    return {name: KINDS[fmu.variables[name].type](value) for name, value in values.items()}
 
 
 def in_fmpy(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
@@ -72,13 +76,20 @@ def in_libcosim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     observer, inputs = CosimObserver.create_last_value(), CosimManipulator.create_override()
     execution.add_observer(observer)
     execution.add_manipulator(inputs)
-    outputs = [fmu.variables[name].reference for name in names]
+    writers = inputs.slave_real_values, inputs.slave_integer_values, inputs.slave_boolean_values
+    readers = observer.last_real_values, observer.last_integer_values, observer.last_boolean_values
+    write, read = (dict(zip(KINDS, functions)) for functions in (writers, readers))
 
     def change(values: Values) -> None:
-        if values:
-            inputs.slave_real_values(slave, [fmu.variables[name].reference for name in values], [*values.values()])
+        for name, value in values.items():
+            variable = fmu.variables[name]
+            write[variable.type](slave, [variable.reference], [value])
 
-    return reference.rows(change, lambda t, h: execution.step(1), partial(observer.last_real_values, slave, outputs))
+    def read_all() -> list[float]:
+        variables = [fmu.variables[name] for name in names]
+        return [read[variable.type](slave, [variable.reference])[0] for variable in variables]
+
+    return reference.rows(change, lambda t, h: execution.step(1), read_all)
 
 
 def in_ecos(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
@@ -90,13 +101,15 @@ def in_ecos(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
         structure.add_parameter_set("start", {f"fmu::{name}": v for name, v in _starts(fmu, reference).items()})
         with EcosSimulation(step_size=reference.step, structure=structure) as simulation:
             simulation.init(start_time=reference.start, parameter_set="start")
+            setters = dict(zip(KINDS, (simulation.set_real, simulation.set_integer, simulation.set_bool)))
+            getters = dict(zip(KINDS, (simulation.get_real, simulation.get_integer, simulation.get_bool)))
 
             def change(values: Values) -> None:
                 for name, value in values.items():
-                    simulation.set_real(f"fmu::{name}", value)
+                    setters[fmu.variables[name].type](f"fmu::{name}", value)
 
             def read() -> list[float]:
-                return [simulation.get_real(f"fmu::{name}") for name in names]
+                return [getters[fmu.variables[name].type](f"fmu::{name}") for name in names]
 
             return reference.rows(change, lambda t, h: simulation.step(1), read)
 
@@ -107,7 +120,8 @@ def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
     slave = Fmi2Slave(str(fmu.path), model_identifier=fmu.description.coSimulation.modelIdentifier)
     slave.instantiate("fmu", Fmi2Type.CO_SIMULATION, guid=fmu.guid)
-    setters = {"Real": slave.set_real, "Integer": slave.set_integer, "Boolean": slave.set_boolean}
+    setters = dict(zip(KINDS, (slave.set_real, slave.set_integer, slave.set_boolean)))
+    getters = dict(zip(KINDS, (slave.get_real, slave.get_integer, slave.get_boolean)))
 
     def change(values: Values) -> None:
         for name, value in values.items():
@@ -117,7 +131,12 @@ def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     slave.setup_experiment(start_time=reference.start)
     slave.enter_initialization_mode()
     slave.exit_initialization_mode()
-    rows = reference.rows(change, slave.do_step, lambda: slave.get_real([fmu.variables[n].reference for n in names]))
+
+    def read() -> list[float]:
+        variables = [fmu.variables[name] for name in names]
+        return [getters[variable.type]([variable.reference])[0] for variable in variables]
+
+    rows = reference.rows(change, slave.do_step, read)
     slave.free_instance()
     return rows
 

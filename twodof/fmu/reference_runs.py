@@ -9,8 +9,9 @@ from __future__ import annotations
 import csv
 import posixpath
 import zipfile
-from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
@@ -21,12 +22,15 @@ from ..bounds import MAX_REFERENCES
 from ..errors import FmuError, SimulationError
 from ..files import read_member
 from .description import Fmu, opened
-from .validation import is_plain_xml
+from .validation import NUMBERS, is_plain_xml
 
 MANIFEST = "extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"
 TIME_TOLERANCE = 1e-6  # fraction of a communication step
+TRUTHS = {"true": "1", "false": "0"}
 MOST_STEPS = 1_000_000
 Values = dict[str, float | bool | int]
+KINDS: dict[str, Callable[[Any], float | bool]] = {"Real": float, "Integer": int, "Boolean": bool}
+"""Types of values, and functions that convert numbers to them."""
 Table = tuple[list[str], NDArray[np.float64]]
 
 
@@ -39,6 +43,7 @@ class Reference(NamedTuple):
         tolerance: tolerance of the results; NaN if it states none.
         parameters: start values by name.
         stimuli, results: names of the columns without the time, and the numbers, with the time in the first column.
+        types: types of variables by name, "Real" without one.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Reference(NamedTuple):
     parameters: Values
     stimuli: Table
     results: Table
+    types: Mapping[str, str] = MappingProxyType({})
 
     @property
     def steps(self) -> int:
@@ -60,9 +66,15 @@ class Reference(NamedTuple):
         return self.start + k * self.step
 
     def inputs(self, k: int) -> Values:
-        """Return the inputs that apply after k steps."""
-        names, numbers = self.stimuli
-        return {n: float(np.interp(self.time(k), numbers[:, 0], numbers[:, i + 1])) for i, n in enumerate(names)}
+        """Return the inputs that apply after k steps, each of its type; those that are not Real are held."""
+        (names, numbers), t = self.stimuli, self.time(k)
+        times = numbers[:, 0]
+        last = max(0, np.searchsorted(times, t + TIME_TOLERANCE * self.step, side="right") - 1)
+        return {
+            n: KINDS[kind](np.interp(t, times, values) if kind == "Real" else values[last])
+            for n, values in zip(names, numbers[:, 1:].T)
+            for kind in [self.types.get(n, "Real")]
+        }
 
     def rows(
         self,
@@ -118,7 +130,8 @@ def references_of(fmu: Fmu) -> list[Reference]:
             found = [files.reference(e) for source in sources for e in files.xml(source).iter("Experiment")]
         except (KeyError, ValueError, csv.Error, ET.ParseError) as error:
             raise FmuError(f"the references in '{fmu.path}' cannot be read: {error}") from error
-    kept = [reference for reference in found if reference is not None]
+    types = {name: variable.type for name, variable in fmu.variables.items()}
+    kept = [reference._replace(types=types) for reference in found if reference is not None]
     if len({reference.name for reference in kept}) < len(kept):
         raise FmuError(f"the references in '{fmu.path}' cannot be told apart: two experiments have one name")
     return kept
@@ -162,18 +175,17 @@ class _Files:
 
     def parameters(self, source: str) -> Values:
         """Return the numbers and Booleans of a parameter set."""
-        read: dict[str, Callable[[str], float | bool]] = {"Real": float, "Float64": float, "Boolean": "true".__eq__}
-        read |= {"Integer": int, "Int32": int}
+        read: dict[str, Callable[[str], float | bool]] = {**NUMBERS, "Float64": float, "Int32": int}
         values: Values = {}
         for parameter in self.xml(source).iterfind(".//{*}Parameter"):
             for kind in parameter:
-                values[parameter.get("name", "")] = read[kind.tag.rpartition("}")[2]](kind.get("value", ""))
+                values[parameter.get("name", "")] = read[kind.tag.rpartition("}")[2]](kind.get("value", "").strip())
         return values
 
     def table(self, source: str) -> Table:
         """Return the columns of a CSV file."""
         head, *rows = csv.reader(self.read(source).decode("utf-8").splitlines())
-        numbers = np.array([[float(cell) for cell in row] for row in rows])
+        numbers = np.array([[float(TRUTHS.get(cell.strip(), cell)) for cell in row] for row in rows])
         if numbers.ndim != 2 or numbers.shape[1] != len(head) or not np.isfinite(numbers).all():
             raise ValueError(f"{source} is not a table of finite numbers")
         return head[1:], numbers
