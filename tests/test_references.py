@@ -23,6 +23,7 @@ from twodof.fmu import checking
 from twodof.fmu.description import load_any_fmu
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
+MANIFEST = f"{FOLDER}fmi-ls-manifest.xml"
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,12 @@ def members(path: Path) -> dict[str, bytes]:
 
 
 def packed(files: dict[str, bytes], path: Path) -> Path:
+    """Write an FMU whose manifest of references has the files' checksums."""
+    manifest = files.get(MANIFEST, b"").decode()
+    for name, text in files.items():
+        digest = hashlib.sha3_256(text).hexdigest()
+        manifest = re.sub(rf'(source="{name.removeprefix(FOLDER)}"[^>]*checksum=")\w*', rf"\g<1>{digest}", manifest)
+    files = {**files, **({MANIFEST: manifest.encode()} if manifest else {})}
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
@@ -52,13 +59,11 @@ def rows(path: Path, *tools: str) -> dict[str, checking.Row]:
 
 def test_the_files_have_the_form_of_the_standards(built: Path) -> None:
     files = members(built)
-    manifest = lxml.etree.fromstring(files[f"{FOLDER}fmi-ls-manifest.xml"])
+    manifest = lxml.etree.fromstring(files[MANIFEST])
     named = {name.partition("}")[2]: value for name, value in manifest.attrib.items()}
     assert named["fmi-ls-name"] == "org.fmi-standard.fmi-ls-ref"
     related = {element.get("source"): element for element in manifest}
-    assert {FOLDER + source for source in related} | {f"{FOLDER}fmi-ls-manifest.xml"} == {
-        name for name in files if name.startswith("extra/")
-    }
+    assert {FOLDER + source for source in related} | {MANIFEST} == {name for name in files if name.startswith("extra/")}
     for source, element in related.items():
         assert element.get("checksum") == hashlib.sha3_256(files[FOLDER + source]).hexdigest()
     assert [s for s, e in related.items() if e.get("role") == "experiment/smoke-test"] == ["references.exp"]
@@ -210,12 +215,29 @@ def test_an_experiment_may_have_any_name_and_needs_results(built: Path, tmp_path
     assert found["reference move"].text == "its results have no values after its start"
 
 
+@pytest.mark.parametrize("name", ["references.exp", "push-ref.csv", "push.ssv"])
+def test_a_file_with_another_checksum_than_stated_is_refused(built: Path, tmp_path: Path, name: str) -> None:
+    files = members(built)
+    with zipfile.ZipFile(tmp_path / "stale.fmu", "w") as archive:
+        for member, content in files.items():
+            archive.writestr(member, content + b"\n" * (member == FOLDER + name))
+    (row,) = rows(tmp_path / "stale.fmu").values()
+    assert row.outcome == "failed" and f"{name} is not the file whose checksum is in fmi-ls-manifest.xml" in row.text
+
+
+def test_results_after_the_end_of_a_run_are_refused(built: Path, tmp_path: Path) -> None:
+    files = members(built)
+    results = f"{FOLDER}move-ref.csv"
+    files[results] = files[results].rstrip() + b"\n0.51" + b",0" * files[results].splitlines()[0].count(b",")
+    row = rows(packed(files, tmp_path / "long.fmu"))["reference move"]
+    assert row[1:] == ("failed", "it has results at 0.51 s, after 0.5 s, the end of its run")
+
+
 def with_references(fmu: bytes, files: dict[str, str], path: Path) -> Path:
     """Write an FMU with files of references, the first of which has the experiments."""
     related = "".join(
-        f'<Related source="{name}" role="{"other" if k else "experiment"}"'
-        f' checksum="{hashlib.sha3_256(text.encode()).hexdigest()}"/>'
-        for k, (name, text) in enumerate(files.items())
+        f'<Related source="{name}" role="{"other" if k else "experiment"}" checksum=""/>'
+        for k, name in enumerate(files)
     )
     path.write_bytes(fmu)
     texts = {**files, "fmi-ls-manifest.xml": f"<fmiReferences>{related}</fmiReferences>"}

@@ -7,6 +7,7 @@ parameter sets of SSP 1.0, and CSV. Deviations are relative to a variable's larg
 from __future__ import annotations
 
 import csv
+import hashlib
 import posixpath
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -102,7 +103,10 @@ class Reference(NamedTuple):
         index = np.rint((numbers[:, 0] - self.start) / self.step).astype(int)
         if np.abs(numbers[:, 0] - self.start - index * self.step).max(initial=0.0) > TIME_TOLERANCE * self.step:
             raise SimulationError("its results are not at communication points")
-        kept = (index > 0) & (index < len(rows))
+        if index.max(initial=0) >= len(rows):
+            end = f"{self.time(len(rows) - 1):g} s, the end of its run"
+            raise SimulationError(f"it has results at {numbers[:, 0].max():g} s, after {end}")
+        kept = index > 0
         expected, found = numbers[kept, 1:], rows[index[kept]]
         if not expected.size:
             raise SimulationError("its results have no values after its start")
@@ -125,7 +129,8 @@ def references_of(fmu: Fmu) -> list[Reference]:
     with opened(fmu) as archive:
         try:
             files = _Files(archive, posixpath.dirname(MANIFEST))
-            related = files.xml(posixpath.basename(MANIFEST)).iter("Related")
+            related = [*files.xml(posixpath.basename(MANIFEST)).iter("Related")]
+            files.digests = {r.get("source", ""): r.get("checksum", "") for r in related if _has_digest(r)}
             sources = [r.get("source", "") for r in related if r.get("role", "").startswith("experiment")]
             found = [files.reference(e) for source in sources for e in files.xml(source).iter("Experiment")]
         except (KeyError, ValueError, csv.Error, ET.ParseError) as error:
@@ -137,16 +142,28 @@ def references_of(fmu: Fmu) -> list[Reference]:
     return kept
 
 
+def _has_digest(related: ET.Element) -> bool:
+    return "checksum" in related.attrib and related.get("checksumType", "SHA3-256") == "SHA3-256"
+
+
 class _Files:
-    """Files in the folder of FMI-LS-REF."""
+    """Files in the folder of FMI-LS-REF.
+
+    Attributes:
+        digests: SHA3-256 of files by their URIs, as the manifest states them.
+    """
 
     def __init__(self, archive: zipfile.ZipFile, folder: str) -> None:
         self._archive, self._folder, self._room = archive, folder, MAX_REFERENCES
+        self.digests: dict[str, str] = {}
 
     def read(self, source: str) -> bytes:
         """Return a file by its relative URI."""
         content = read_member(self._archive, posixpath.normpath(f"{self._folder}/{unquote(source)}"), self._room)
         self._room -= len(content)
+        found = hashlib.sha3_256(content).hexdigest()
+        if self.digests.get(source, found).lower() != found:
+            raise ValueError(f"{source} is not the file whose checksum is in {posixpath.basename(MANIFEST)}")
         return content
 
     def xml(self, source: str) -> ET.Element:
