@@ -57,6 +57,9 @@ FAULTS = {
     "DISCARDS": ("simulation", "a call failed, status 2"),
     "READS_CHANGE": ("simulation", "in a second read at one time: y is"),
     "COUNTS": ("reset", "after a reset: n is"),
+    "KEEPS_INPUT": ("reset", "u is 0.0001 after a reset, and its start value is 0.0"),
+    "KEEPS_PARAMETER": ("reset", "p is 1.0001 after a reset, and its start value is 1.0"),
+    "ONE_SEED": ("derivatives", "the derivative of y with a seed of several variables is 2"),
 }
 ALSO = {
     "SHARES": ("state", "serialised state"),
@@ -67,11 +70,12 @@ ALSO = {
 REMARK = "it accepts the end of an initialisation that was not begun, a step of a negative size, a step from another"
 
 
-def foreign(folder: Path, fault: str = "NONE", description: str = DESCRIPTION) -> Path:
+def foreign(folder: Path, fault: str = "NONE", description: str = DESCRIPTION, x: float = 1.0) -> Path:
     library, path = folder / "Foreign.so", folder / "Foreign.fmu"
     headers = Path(fmpy.__file__).parent / "c-code"
     source = Path(__file__).parent / "native" / "foreign.c"
-    command = [needs("gcc"), "-shared", "-fPIC", f"-DFAULT={fault}", f"-I{headers}", str(source), "-o", str(library)]
+    defined = [f"-DFAULT={fault}", f"-DX={x}"]
+    command = [needs("gcc"), "-shared", "-fPIC", *defined, f"-I{headers}", str(source), "-o", str(library)]
     subprocess.run(command, check=True)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", description)
@@ -115,6 +119,36 @@ def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
     if fault not in ("NOT_FINITE", "DISCARDS", "READS_CHANGE"):
         assert {*failed(check)} == {row, *ALSO.get(fault, ())}
     assert not check.passed and len(check.rows) == 12
+
+
+@pytest.mark.parametrize("fault", ["KEEPS", "SHARES", "RESTORES_NOTHING"])
+def test_a_fault_of_an_fmu_at_rest_fails_its_row(fault: str, tmp_path: Path) -> None:
+    """Its state and its input are 0."""
+    row, text = FAULTS[fault]
+    assert failed(twodof.check(foreign(tmp_path, fault, x=0.0)))[row].startswith(text)
+
+
+def test_derivatives_of_a_large_output_are_compared_within_its_rounding(tmp_path: Path) -> None:
+    check = twodof.check(foreign(tmp_path, "HIGH"))
+    assert check.passed and {row.name: row for row in check.rows}["derivatives"].outcome == "passed", check
+
+
+def test_a_discarded_large_step_is_a_remark(tmp_path: Path) -> None:
+    check = twodof.check(foreign(tmp_path, "DISCARDS_LARGE"))
+    rows = {row.name: row for row in check.rows}
+    assert check.passed and rows["variable steps"][1:] == ("remark", "it discards a step of 0.02 s at 0.02 s")
+
+
+def test_a_start_value_that_is_not_a_number_is_equal_to_itself(tmp_path: Path) -> None:
+    described = DESCRIPTION.replace('variability="fixed"><Real start="1"/>', 'variability="fixed"><Real start="NaN"/>')
+    assert twodof.check(foreign(tmp_path, "UNSET", described)).passed
+
+
+def test_an_fmu_without_outputs_is_not_compared(tmp_path: Path) -> None:
+    described = DESCRIPTION.replace('causality="output"', "").replace('<Outputs><Unknown index="4"/></Outputs>', "")
+    described = described.replace('<Unknown index="4"/></Init', "</Init")
+    rows = {row.name: row.outcome for row in twodof.check(foreign(tmp_path, description=described)).rows}
+    assert {name for name in ("reset", "two instances", "state") if rows[name] != "does not apply"} == set()
 
 
 def test_a_variable_with_an_alias_is_tried(tmp_path: Path) -> None:
@@ -167,6 +201,13 @@ def test_an_undeclared_dependency_fails(tmp_path: Path) -> None:
     described = described.replace('dependencies="2"/>', 'dependencies="2"/></InitialUnknowns>')
     texts = failed(twodof.check(foreign(tmp_path, description=described)))
     assert texts == {"inputs": "y depends on u, and its InitialUnknown does not declare it"}
+
+
+def test_an_undeclared_feedthrough_fails(tmp_path: Path) -> None:
+    """An output states that it depends only on a state, after the start."""
+    described = DESCRIPTION.replace('<Outputs><Unknown index="4"/>', '<Outputs><Unknown index="4" dependencies="2"/>')
+    texts = failed(twodof.check(foreign(tmp_path, description=described)))
+    assert texts == {"inputs": "y depends on u, and its Output does not declare it"}
 
 
 def test_a_row_without_a_claimed_feature_does_not_apply(tmp_path: Path) -> None:

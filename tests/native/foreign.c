@@ -6,12 +6,16 @@
 #include "fmi2Functions.h"
 
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
-       READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE };
+       READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
+       KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET };
+#ifndef X
+#define X 1.0
+#endif
 typedef struct { double u, x, p; int phase; } M;
 static double shared;
 static int count, living;
-static void start(M *m) { *m = (M){0.0, 1.0, 1.0, 0}; }
-static double y_of(M *m) { return (FAULT == SHARES ? shared : m->x) + 2.0 * m->u; }
+static void start(M *m) { *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0}; }
+static double y_of(M *m) { return (FAULT == SHARES ? shared : m->x) + 2.0 * m->u + (FAULT == HIGH ? 1e6 : 0.0); }
 
 fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
                               fmi2Boolean v, fmi2Boolean l) {
@@ -21,11 +25,13 @@ fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String
 }
 void fmi2FreeInstance(fmi2Component c) { living = 0; free(c); }
 fmi2Status fmi2Reset(fmi2Component c) {
-    double x = ((M *)c)->x;
+    M old = *(M *)c;
     if (FAULT == HANGS) for (;;) sleep(1);
     if (FAULT == GREEDY && fopen("litter", "w") && !malloc((size_t)5 << 30)) abort();
     start(c);
-    if (FAULT == KEEPS) ((M *)c)->x = x;
+    if (FAULT == KEEPS) ((M *)c)->x = old.x;
+    if (FAULT == KEEPS_INPUT) ((M *)c)->u = old.u;
+    if (FAULT == KEEPS_PARAMETER) ((M *)c)->p = old.p;
     return fmi2OK;
 }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return ((M *)c)->phase ? fmi2Error : fmi2OK; }
@@ -51,6 +57,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
     M *m = c;
     if (m->phase != 1) return fmi2Error;
     if (FAULT == DISCARDS && t > 0.05) return fmi2Discard;
+    if (FAULT == DISCARDS_LARGE && h > 0.015) return fmi2Discard;
     m->x += h * (m->u - m->x);
     shared += h * (m->u - shared);
     return fmi2OK;
@@ -77,7 +84,7 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
                                         const fmi2ValueReference v[], size_t nv, const fmi2Real dv[], fmi2Real dz[]) {
     for (size_t i = 0; i < nz; i++) {
         dz[i] = 0.0;
-        for (size_t k = 0; k < nv; k++) {
+        for (size_t k = 0; k < (FAULT == ONE_SEED ? 1 : nv); k++) {
             double of_y = v[k] == 1 ? 2.0 : 1.0, of_rate = v[k] == 1 ? 1.0 : -1.0;
             dz[i] += dv[k] * (z[i] == 4 ? of_y * (FAULT == WRONG_SLOPE ? 1.00001 : 1.0) : of_rate);
         }

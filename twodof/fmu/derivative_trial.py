@@ -18,6 +18,7 @@ SMOOTH, EXACT = 1e-3, 1e-7
 """Largest difference between the difference quotients of two widths with which a derivative is compared, and tolerance
 of the comparison in addition to it, both relative to the derivative's magnitude or to 1.
 """
+ULPS = 8.0  # spacings of numbers by which an output may be rounded
 Array = NDArray[np.float64]
 
 
@@ -26,7 +27,7 @@ class Slopes(NamedTuple):
 
     Attributes:
         best: extrapolated from those of two widths.
-        doubt: difference of the two.
+        doubt: difference of the two, and the effect of rounding.
     """
 
     best: Array
@@ -69,17 +70,14 @@ class Point:
 
     def slopes(self, instance: Instance, name: str, change: Callable[[Mapping[str, float]], object]) -> Slopes:
         """Return the slopes over a variable, which is changed by a function."""
-        read = instance.reader(self.unknowns)
-
-        def slope(width: float) -> Array:
-            values = []
-            for delta in (-width, width):
-                change({name: self.values[name] + delta})
-                values.append(np.array(read()))
-            return np.asarray((values[1] - values[0]) / (2.0 * width))
-
-        wide, narrow = slope(self._widths[name]), slope(0.5 * self._widths[name])
-        return Slopes((4.0 * narrow - wide) / 3.0, np.abs(narrow - wide))
+        read, width = instance.reader(self.unknowns), self._widths[name]
+        low, high, lower, higher = rows = np.empty((4, len(self.unknowns)))
+        for row, delta in zip(rows, (-0.5 * width, 0.5 * width, -width, width)):
+            change({name: self.values[name] + delta})
+            row[:] = read()
+        wide, narrow = (higher - lower) / (2.0 * width), (high - low) / width
+        rounding = ULPS * np.spacing(np.abs(rows).max(axis=0)) / width
+        return Slopes((4.0 * narrow - wide) / 3.0, np.abs(narrow - wide) + rounding)
 
     def between_samples(self, instance: Instance, name: str) -> NDArray[np.bool_]:
         """Return where derivatives over an input are not those of the differences after a part of a step."""
@@ -102,6 +100,19 @@ class Point:
         return np.asarray((np.array(read()) == before) & (reads_state() != at))
 
 
+def _check_sum(instance: Instance, point: Point, stated: Array) -> None:
+    """Compare the derivative along all knowns with the sum of those along each."""
+    seed = {name: 1.0 + k % 7 for k, name in enumerate(point.values)}
+    parts = stated * [*seed.values()]
+    total, scale = parts.sum(axis=1), np.maximum(1.0, np.abs(parts).sum(axis=1))
+    found = instance.directional(point.unknowns, seed)
+    wrong = np.isfinite(total) & ~(np.abs(found - total) <= EXACT * scale)
+    if wrong.any():
+        k = int(wrong.argmax())
+        what = f"the derivative of {point.unknowns[k]} with a seed of several variables"
+        raise SimulationError(f"{what} is {found[k]:.9g}, and the sum of those with one seed each is {total[k]:.9g}")
+
+
 def derivatives(trial: Trial) -> str:
     """Compare directional derivatives with central differences.
 
@@ -115,6 +126,7 @@ def derivatives(trial: Trial) -> str:
     with trial.instance(point.values) as instance:
         trial.note("directional derivatives")
         stated = instance.derivatives(point.unknowns, [*point.values])
+        _check_sum(instance, point, stated)
 
         def at_start(values: Mapping[str, float]) -> None:
             trial.begin_again(instance, {**point.values, **values})

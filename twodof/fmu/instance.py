@@ -235,17 +235,22 @@ class Instance:
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
         """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
+        matrix = np.empty((len(unknown), len(known)))
+        for k, name in enumerate(known):
+            matrix[:, k] = self.directional(unknown, {name: 1.0})
+        return matrix
+
+    def directional(self, unknown: Sequence[str], seed: Mapping[str, float]) -> NDArray[np.float64]:
+        """Return the derivatives of unknowns along a change of knowns."""
         distinct, rows, size = self._columns(unknown)
-        matrix = np.empty((size, len(known)))
-        for k, variable in enumerate(self.fmu.variables[name] for name in known):
-            seed = np.eye(len(self._starts[variable.type, variable.reference]))[variable.element]
-            try:
-                matrix[:, k] = self.slave.getDirectionalDerivative(
-                    distinct, [variable.reference], seed, *self._of_size(size)
-                )
-            except FMICallException as error:
-                self._refuse(error.status)
-        return matrix[rows]
+        references, columns, width = self._columns([*seed])
+        changes = np.zeros(width)
+        changes[columns] = [*seed.values()]
+        try:
+            found = self.slave.getDirectionalDerivative(distinct, references, changes, *self._of_size(size))
+        except FMICallException as error:
+            self._refuse(error.status)
+        return np.array(found)[rows]
 
     def free(self) -> None:
         """End the instance; after a fatal failure the standard allows no further call."""

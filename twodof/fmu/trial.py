@@ -36,6 +36,7 @@ class Trial:
         start, step: start time and step of its default experiment, s.
         variables: FMPy's descriptions of real variables, by the names of their elements.
         outputs, inputs: names of real outputs and continuous inputs.
+        starts: start values of real inputs and parameters that have one.
         others: names of integer and Boolean outputs.
     """
 
@@ -55,6 +56,23 @@ class Trial:
         ]
         inputs = [name for name, v in self.variables.items() if v.causality == "input"]
         self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
+
+        known = [name for name, v in self.variables.items() if v.causality in ("input", "parameter")]
+        values = ((name, fmu.variables[name].start_value) for name in known)
+        self.starts = {name: value for name, value in values if value is not None}
+
+    def changed_inputs(self) -> dict[str, float]:
+        """Return values of the inputs that differ from their start values, so that an FMU at rest moves."""
+        return {name: self.inside(name, DELTA) for name in self.inputs}
+
+    def changed_parameters(self) -> dict[str, float]:
+        """Return values of parameters that differ from their start values; a parameter of 0 is often a switch."""
+        numbers = {name: start for name, start in self.starts.items() if start and isfinite(start)}
+        return {
+            name: self.inside(name, DELTA * abs(start))
+            for name, start in numbers.items()
+            if self.variables[name].causality == "parameter" and self.variables[name].variability != "constant"
+        }
 
     def require(self, *claims: str) -> None:
         """End a trial of a feature that the description does not claim."""
@@ -93,6 +111,11 @@ class Trial:
         """Return a function that reads all outputs, real ones first."""
         read = instance.reader(self.outputs)
         return lambda: (*read(), *(instance.value(name) for name in self.others))
+
+    def require_outputs(self) -> None:
+        """End a trial that would compare nothing."""
+        if not self.outputs and not self.others:
+            raise UnpassedError("does not apply", "it has no outputs of numbers or Booleans to compare")
 
     def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
         """Raise for rows that are not equal, with the name of the first output that differs."""
