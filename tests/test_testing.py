@@ -55,6 +55,21 @@ def test_a_limit_that_is_exceeded_is_named(tmp_path, native_path):
         assert_within_limits(bag)
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_a_position_that_is_not_finite_exceeds_its_limit(runs, value):
+    bag = twodof.read_bag(runs["good"])
+    q = bag.q.copy()
+    q[7, 1] = value
+    with pytest.raises(AssertionError, match=f"q of joint 'joint2' is {value} at 0.07 s, its limit is"):
+        assert_within_limits(dataclasses.replace(bag, q=q))
+
+
+def test_velocities_in_one_of_two_bags_fail(runs):
+    bag = twodof.read_bag(runs["good"])
+    with pytest.raises(AssertionError, match="v is missing in the run or in its reference"):
+        assert_equal(dataclasses.replace(bag, v=bag.v[:, :0]), bag, within=1.0)
+
+
 def test_a_deviation_is_named_with_its_time(runs):
     good, pushed = (twodof.read_bag(runs[name]) for name in ("good", "pushed"))
     k = int((abs(good.q - pushed.q) > 1e-5).any(axis=1).argmax())

@@ -78,6 +78,7 @@ def assert_within_limits(run: Recording | str | Path) -> None:
         if values.shape != bag.q.shape:
             continue
         beyond = np.maximum(low - values, values - high) > EXACT * np.maximum(1.0, np.abs(values))
+        beyond |= ~np.isfinite(values)
         if beyond.any():
             k, i = np.argwhere(beyond)[0]
             bound = high[i] if values[k, i] > high[i] else low[i]
@@ -110,6 +111,8 @@ def assert_equal(run: Recording | str | Path, reference: Recording | str | Path,
         _fail(bag, "the run has {}, and its reference {}".format(*spans), [])
     for name in ("q", "v"):
         values, expected = getattr(bag, name), getattr(other, name)
+        if values.shape != expected.shape:
+            _fail(bag, f"{name} is missing in the run or in its reference '{other.path}'", [])
         off = np.abs(values - expected)
         if not (off <= within).all():
             k, i = np.argwhere(~(off <= within))[0]
