@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import random
 import re
 import time
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from itertools import count, pairwise
@@ -194,6 +196,28 @@ def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp
         path = loop(tmp_path / "loop.ssp", plant, pd, text)
         assert twodof.experiment(path, step=H).steps == N
         np.testing.assert_array_equal(q_of(path), expected)
+
+
+def test_a_robot_in_other_units_than_those_of_a_bag_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    with zipfile.ZipFile(io.BytesIO(plant)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    text, scaled = files["modelDescription.xml"], rb'\1 factor="0.0174533"'
+    files["modelDescription.xml"] = re.sub(rb'(<Unit name="rad/s">\s*<BaseUnit[^>]*) factor="1"', scaled, text)
+    (tmp_path / "plant.fmu").write_bytes(degrees := zipped(files))
+    for path in (tmp_path / "plant.fmu", loop(tmp_path / "loop.ssp", degrees, pd)):
+        with pytest.raises(FmuError, match=r"v\[1\] is in rad/s; a robot needs SI units"):
+            twodof.load_fmu(path)
+
+
+def test_a_run_has_the_times_of_the_default_experiment(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    wired = f"{BOTH}<ssd:Connections>{WIRES}</ssd:Connections>"
+    for times, expected in (('startTime="1" stopTime="1.5"', (1.0, 1.5)), ('startTime="-1"', (-1.0, 4.0))):
+        text = ssd(wired, f"<ssd:DefaultExperiment {times}/>")
+        run = twodof.experiment(loop(tmp_path / "loop.ssp", plant, pd, text), step=H)
+        assert (run.start_time, run.time(run.steps)) == expected
+    with closing(twodof.samples(run)) as samples:
+        assert next(samples).t == -1.0
+    assert twodof.experiment(tmp_path / "loop.ssp", step=H, stop_time=0.0).steps == 100
 
 
 def nested(plant: bytes, pd: bytes, path: Path, top_values: str = "", inner_values: str = "") -> Path:
@@ -668,8 +692,6 @@ def test_the_fmus_of_a_system_have_a_limited_size(
 
 
 def test_an_fmu_that_is_a_link_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:
-    import zipfile
-
     system = loop(tmp_path / "link.ssp", plant, pd)
     link = zipfile.ZipInfo("resources/link.fmu")
     link.external_attr = 0o120777 << 16

@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import chain, product
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,9 @@ from ..files import read_member, shown
 from ..notebook import card, picture
 from .archives import checksums, open_archive, read_archive
 from .validation import NUMBERS, problems_of_names, read_description
+
+RECORDED = ("q", "v", "x", "xd", "tau", "q_des", "x_des")
+"""Vectors of a robot that bags, verdicts and plots contain in SI units."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +241,8 @@ def logged(fmu: Fmu) -> Fmu:
     """Return an FMU with outputs q[i] and v[i], its joints named.
 
     Raises:
-        FmuError: it has no such outputs, or not as many as joints, or task vectors of a wrong length.
+        FmuError: it has no such outputs, or not as many as joints, or task vectors of a wrong length, or other units
+            than those of ROS 2's messages.
     """
     n = len(fmu.vector("q"))
     if not fmu.joints:
@@ -248,6 +252,11 @@ def logged(fmu: Fmu) -> Fmu:
     if len(states) != 2 * n or kinds != {("output", "Real")}:
         remedy = "; it is a controller: connect it to a robot in an SSP file" if "tau_cmd[1]" in fmu.variables else ""
         raise FmuError(f"'{fmu.path}' has no outputs q[1], q[2], … and v[1], v[2], … to log{remedy}")
+    bases = {unit.name: unit.baseUnit for unit in fmu.description.unitDefinitions if unit.baseUnit is not None}
+    scaled = {name for name, base in bases.items() if (base.factor or 1.0, base.offset or 0.0) != (1.0, 0.0)}
+    for name in chain(*map(fmu.vector, RECORDED)):
+        if (unit := fmu.variables[name].unit) in scaled:
+            raise FmuError(f"'{fmu.path}': {name} is in {unit}; a robot needs SI units, as rad, m and N.m")
     if len(fmu.joints) != n:
         raise FmuError(f"'{fmu.path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):

@@ -80,7 +80,7 @@ class Experiment:
 class ExperimentOptions(TypedDict, total=False):
     """Keywords of ``experiment``."""
 
-    start_time: float
+    start_time: float | None
     stop_time: float | None
     step: float | None
     settings: Mapping[str, Setting] | None
@@ -93,7 +93,7 @@ class ExperimentOptions(TypedDict, total=False):
 def experiment(
     fmu: Fmu | str | Path,
     *,
-    start_time: float = 0.0,
+    start_time: float | None = None,
     stop_time: float | None = None,
     step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
@@ -106,7 +106,7 @@ def experiment(
 
     Args:
         fmu: the FMU or its path.
-        start_time, stop_time, step: s; the stop time may be infinite. None: the FMU's default, or 5 s and 10 ms.
+        start_time, stop_time, step: s; the stop time may be infinite. None: the FMU's default, or 0, 5 s and 10 ms.
         settings: start values by name; a vector has one value for all elements, or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
         changes: instead of a file, times, s, and the inputs that change; earlier changes apply at the start.
@@ -117,10 +117,7 @@ def experiment(
         InputError, FmuError: an argument or the FMU is invalid; the message names it.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
-    _check_times(start_time=start_time, stop_time=stop_time, step=step)
-    step = default(fmu, "stepSize", 0.01) if step is None else step
-    if stop_time is None:
-        stop_time = start_time + default(fmu, "stopTime", 5.0) - default(fmu, "startTime", 0.0)
+    start_time, stop_time, step = _times(fmu, start_time, stop_time, step)
     given = resolve(fmu, settings or {})
     due = _due(fmu, changes or [])
     given = {**pop_until(math.nextafter(start_time, -inf), due), **given}
@@ -160,10 +157,15 @@ def _report_late(run: Experiment, source: str) -> None:
         )
 
 
-def _check_times(**times: object) -> None:
-    for name, seconds in times.items():
+def _times(fmu: Fmu, start: float | None, stop: float | None, step: float | None) -> tuple[float, float, float]:
+    """Return start time, stop time and step, by default those of the FMU."""
+    for name, seconds in {"start_time": start, "stop_time": stop, "step": step}.items():
         if not isinstance(seconds, Real | None):
             raise InputError(f"`{name}` is {seconds!r:.50}, not a number of seconds")
+    first = default(fmu, "startTime", 0.0)
+    start = first if start is None else start
+    stop = start + default(fmu, "stopTime", first + 5.0) - first if stop is None else stop
+    return start, stop, default(fmu, "stepSize", 0.01) if step is None else step
 
 
 def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str, Value]:
