@@ -168,10 +168,12 @@ def test_another_start_value_than_the_stated_one_fails(tmp_path: Path) -> None:
     assert texts == {"start values": "p is 1.0 before it is set, and its start value is 2.0"}
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.002])
 @pytest.mark.parametrize("part", ["all", "controller"])
-def test_a_sampled_controller_passes(part: Any, tmp_path: Path) -> None:
-    """Its effort depends on the target at a sampling instant, and not between two samples."""
-    options = twodof.FmuOptions(native=True, part=part, settings={"control_period": 0.01})
+def test_a_sampled_controller_passes(part: Any, delay: float, tmp_path: Path) -> None:
+    """Its effort depends on the target at a sampling instant, or a delay later, and not between two samples."""
+    settings = {"control_period": 0.01, "control_delay": delay}
+    options = twodof.FmuOptions(native=True, part=part, settings=settings)
     check = twodof.check(twodof.build_fmu(tmp_path / "arm.fmu", options))
     assert not failed(check), str(check)
 

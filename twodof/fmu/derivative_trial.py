@@ -94,10 +94,10 @@ class Point:
         trial = self._trial
         read, reads_state = instance.reader(self.unknowns), instance.reader([state])
         trial.begin_again(instance, self.values)
-        before, at = np.array(read()), reads_state()
+        before, at = np.array(read()), reads_state()[0]  # a later read has the same buffer
         varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
         instance.step(trial.start, trial.step * (PART if varies else 1.0))
-        return np.asarray((np.array(read()) == before) & (reads_state() != at))
+        return np.asarray((np.array(read()) == before) & (reads_state()[0] != at))
 
 
 def _check_sum(instance: Instance, point: Point, stated: Array) -> None:
