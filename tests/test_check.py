@@ -15,7 +15,7 @@ import fmpy
 import pytest
 from fmpy.model_description import ModelDescription, ModelVariable
 from fmpy.validation import _validate_variable_names
-from systems import loop, pd_fmu
+from systems import component, connection, loop, pd_fmu, ssd
 from tools import needs
 
 import twodof
@@ -301,6 +301,34 @@ def test_the_command_prints_a_table_or_json(
     with pytest.raises(SystemExit) as ended:
         main(["check"])
     assert ended.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "text"),
+    [
+        ("pd.nothing", "pd.q[1]", "there is no 'pd.nothing'"),
+        ("pd.q[1]", "pd.v[1]", "is not from an output to an input"),
+        ("pd.on", "pd.enabled", "has an algebraic loop"),
+    ],
+)
+def test_only_connections_that_ssp_forbids_fail(start: str, end: str, text: str, tmp_path: Path) -> None:
+    wire = connection(start, end)
+    structure = ssd(f"<ssd:Elements>{component('pd')}</ssd:Elements><ssd:Connections>{wire}</ssd:Connections>")
+    row = twodof.check(loop(tmp_path / "loop.ssp", b"", pd_fmu(), structure)).rows[0]
+    assert text in row.text and row.outcome == ("remark" if "loop" in text else "failed")
+
+
+@pytest.mark.parametrize(
+    ("times", "text"),
+    [
+        ('stepSize="-0.01"', "its step of -0.01 s is not > 0"),
+        ('stepSize="NaN"', "its step of nan s is not > 0"),
+        ('startTime="2" stopTime="1"', "its stop time 1 s is before its start at 2 s"),
+    ],
+)
+def test_times_that_no_run_can_have_fail(times: str, text: str, tmp_path: Path) -> None:
+    described = re.sub("<DefaultExperiment.*/>", f"<DefaultExperiment {times}/>", DESCRIPTION)
+    assert failed(twodof.check(foreign(tmp_path, description=described)))["description"] == f"DefaultExperiment: {text}"
 
 
 def test_each_fmu_of_a_system_is_checked(tmp_path: Path) -> None:

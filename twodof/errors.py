@@ -55,6 +55,10 @@ class FmuError(TwoDofError):
     """The file is not an FMU that this master can run."""
 
 
+class SspError(FmuError):
+    """The connections of a system are not those that SSP 1.0 allows."""
+
+
 class InputError(TwoDofError):
     """A setting, an input file or a time of the run is invalid."""
 

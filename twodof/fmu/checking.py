@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_ROW, MIN_STEP
 from ..children import Child, limit
-from ..errors import FmuError, InputError
+from ..errors import FmuError, InputError, SspError
 from ..export.package import has_member
 from ..files import temporary_folder
 from ..notebook import card
@@ -99,7 +99,8 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
         text, remarks = f"{len(system.components)} components, {len(system.links)} connections", system.remarks()
         first = Row("structure", "remark" if remarks else "passed", "; ".join([text, *remarks]))
     except FmuError as error:
-        first = Row("structure", "remark", f"'twodof run' refuses it: {error}")
+        outcome = "failed" if isinstance(error, SspError) else "remark"
+        first = Row("structure", outcome, f"'twodof run' refuses it: {error}")
     rows = ((name, row) for source, name in names.items() for row in _rows(path, source, ()))
     return Check(path, (first, *(row._replace(name=f"{name}: {row.name}") for name, row in rows)))
 

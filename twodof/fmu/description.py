@@ -24,7 +24,7 @@ from ..export.start_values import groups_of, vector
 from ..files import read_member, shown
 from ..notebook import card, picture
 from .archives import checksums, open_archive, read_archive
-from .validation import NUMBERS, problems_of_names, read_description
+from .validation import NUMBERS, problems_of_names, problems_of_times, read_description
 
 RECORDED = ("q", "v", "x", "xd", "tau", "q_des", "x_des")
 """Vectors of a robot that bags, verdicts and plots contain in SI units."""
@@ -229,6 +229,7 @@ def problems_of(path: Path, inside: str = "") -> list[str]:
     try:
         root = ET.fromstring(xml)
         found += problems_of_names(root)
+        found += problems_of_times(root)
         read_description(root, xml, validate_model_structure=True)
     except ValidationError as error:
         found += [" ".join(problem.split()) for problem in error.problems]

@@ -20,6 +20,8 @@ SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3
 TRUE = ("true", "1")
 NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": TRUE.__contains__}
 """Supported types of variables, and functions that parse their start values."""
+TIMES = {"startTime": 0.0, "stopTime": math.inf, "stepSize": 1.0}
+"""Times of a default experiment, and values for those that it does not state."""
 PART = r"""([A-Za-z_]\w*|'([\w!#$%&()*+,\-./:;<>=?@\[\]^{}|~ ]|\\['"?\\abfnrtv])+')(\[\d+(,\d+)*\])?"""
 CONVENTIONS = {
     "flat": re.compile(r"[^\r\n\t]*"),
@@ -74,6 +76,14 @@ def problems_of_names(root: ET.Element) -> list[str]:
     names = [v.get("name", "") for path in ("*", "*/Alias") for v in root.iterfind(f"ModelVariables/{path}")]
     wrong = [name for name in names if not CONVENTIONS[kind].fullmatch(name)]
     return [f'"{name}" is no legal variable name for the naming convention "{kind}".' for name in wrong]
+
+
+def problems_of_times(root: ET.Element) -> list[str]:
+    """Return the faults of the default experiment."""
+    times = getattr(root.find("DefaultExperiment"), "attrib", {})
+    start, stop, step = (float(times.get(f"{key}", end)) for key, end in TIMES.items())
+    wrong = [] if stop >= start else [f"DefaultExperiment: its stop time {stop:g} s is before its start at {start:g} s"]
+    return wrong + ([] if 0.0 < step < math.inf else [f"DefaultExperiment: its step of {step:g} s is not > 0"])
 
 
 def _check_arrays(root: ET.Element) -> None:

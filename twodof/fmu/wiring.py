@@ -9,7 +9,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 from ..bounds import MAX_COMPONENTS, MAX_WIRING
-from ..errors import FmuError, choice
+from ..errors import FmuError, SspError, choice
 from .description import Fmu, Scalar
 from .ssp_file import EXPONENTS, IDENTITY, Affine, Connector, Element, Unit, transformation
 from .validation import NUMBERS, TRUE
@@ -63,7 +63,7 @@ class Wiring:
         if (fmu := self._fmus.get(node.element)) is None:
             return None
         if node.connector not in fmu.variables:
-            raise FmuError(f"'{self._path}': there is no '{node!s:.80}'{choice(node.connector, fmu.variables)}")
+            raise SspError(f"'{self._path}': there is no '{node!s:.80}'{choice(node.connector, fmu.variables)}")
         return fmu.variables[node.connector]
 
     def find(self, name: str) -> Node | None:
@@ -91,7 +91,7 @@ class Wiring:
         what = f"'{self._path}': the connector '{node}' states"
         for word, says, has in (("type", connector.type, scalar.type), ("kind", connector.kind, scalar.causality)):
             if {says, has} <= {*NUMBERS, "input", "output"} and says != has:
-                raise FmuError(f"{what} the {word} {says}, and its FMU {has}; state that of the FMU")
+                raise SspError(f"{what} the {word} {says}, and its FMU {has}; state that of the FMU")
         if stated.exponents is None and own.name and stated.name not in ("", own.name):
             raise FmuError(
                 f"{what} the unit '{stated.name}' without a definition, and its FMU '{own.name}'; state that"
@@ -100,7 +100,7 @@ class Wiring:
             return
         alike = stated.exponents == own.exponents and math.isclose(stated.factor, own.factor, rel_tol=ROUNDING)
         if not alike or not math.isclose(stated.offset, own.offset, rel_tol=ROUNDING):
-            raise FmuError(f"{what} the unit '{stated.name}', and its FMU another, '{own.name}'; state that of the FMU")
+            raise SspError(f"{what} the unit '{stated.name}', and its FMU another, '{own.name}'; state that of the FMU")
 
     def _kind(self, node: Node) -> str:
         scalar = self.scalar(node)
@@ -108,7 +108,7 @@ class Wiring:
             return scalar.causality
         connectors = self.elements[node.element].connectors
         if node.connector not in connectors:
-            raise FmuError(f"'{self._path}': there is no connector '{node}'{choice(node.connector, connectors)}")
+            raise SspError(f"'{self._path}': there is no connector '{node}'{choice(node.connector, connectors)}")
         return connectors[node.connector].kind
 
     def _connect(self, system: Element, connection: ET.Element) -> None:
@@ -118,7 +118,7 @@ class Wiring:
             inner = connection.get(f"{end}Element", "")
             name = system.name if not inner else f"{system.name}.{inner}" if system.name else inner
             if name not in self.elements:
-                raise FmuError(f"'{self._path}': a connection names '{inner:.80}', which is not an element")
+                raise SspError(f"'{self._path}': a connection names '{inner:.80}', which is not an element")
             node = Node(name, connection.get(f"{end}Connector", ""))
             gives = (self._kind(node) in SOURCES) == bool(inner)
             ends.append((node, gives))
@@ -126,11 +126,11 @@ class Wiring:
         what = f"'{self._path}': the connection of '{start}' and '{sink}'"
         affine = transformation(connection, what)
         if start_gives == sink_gives or (sink_gives and affine != IDENTITY):
-            raise FmuError(f"{what} is not from an output to an input")
+            raise SspError(f"{what} is not from an output to an input")
         if sink_gives:
             start, sink = sink, start
         if sink in self._incoming:
-            raise FmuError(f"'{self._path}': two connections end at '{sink}'; leave one out")
+            raise SspError(f"'{self._path}': two connections end at '{sink}'; leave one out")
         self._incoming[sink] = start, connection.get("suppressUnitConversion") not in TRUE, affine
 
     def links(self) -> list[Link]:
@@ -203,7 +203,7 @@ class Wiring:
                 " is not defined"
             )
         if source.exponents != target.exponents:
-            raise FmuError(
+            raise SspError(
                 f"'{self._path}': {what} have units of different dimensions, '{source.name}' and '{target.name}'"
             )
         if not (target.factor and source.factor and math.isfinite(source.factor / target.factor)):
