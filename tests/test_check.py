@@ -59,11 +59,13 @@ FAULTS = {
     "COUNTS": ("reset", "after a reset: n is"),
     "KEEPS_INPUT": ("reset", "u is 0.0001 after a reset, and its start value is 0.0"),
     "KEEPS_PARAMETER": ("reset", "p is 1.0001 after a reset, and its start value is 1.0"),
+    "RESTORES_NO_INPUT": ("state", "at the restored state: y is"),
     "ONE_SEED": ("derivatives", "the derivative of y with a seed of several variables is 2"),
 }
 ALSO = {
     "SHARES": ("state", "serialised state"),
     "RESTORES_NOTHING": ("serialised state",),
+    "RESTORES_NO_INPUT": ("serialised state",),
     "CRASHES": ("serialised state",),
     "COUNTS": ("simulation", "two instances", "state", "serialised state"),
 }

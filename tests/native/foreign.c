@@ -7,7 +7,8 @@
 
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
        READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
-       KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET };
+       KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
+       RESTORES_NO_INPUT };
 #ifndef X
 #define X 1.0
 #endif
@@ -65,7 +66,9 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) { *s = malloc(sizeof(M)); *(M *)*s = *(M *)c; return fmi2OK; }
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
     if (FAULT == CRASHES) abort();
+    double u = ((M *)c)->u;
     if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;
+    if (FAULT == RESTORES_NO_INPUT) ((M *)c)->u = u;
     return fmi2OK;
 }
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *s) { free(*s); *s = NULL; return fmi2OK; }

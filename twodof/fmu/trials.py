@@ -119,6 +119,7 @@ def _restored(trial: Trial, converted: Callable[[Any, Any], Any]) -> str:
         saved, read = instance.slave.getFMUState(), trial.reader(instance)
         before = read()
         once = trial.rows(instance, half, half)
+        instance.set({name: trial.starts[name] for name in trial.inputs if name in trial.starts})
         trial.note("restoring the state")
         instance.slave.setFMUState(converted(instance.slave, saved))
         trial.compare([before], [read()], "at the restored state")
