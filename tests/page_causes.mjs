@@ -4,12 +4,13 @@ import { createInterface } from "node:readline";
 const [{ Verdict }, { Robot }, { Samples }] = await Promise.all(
   ["verdict", "robot", "samples"].map((name) => import(`${process.argv[2]}/${name}.js`)));
 for await (const line of createInterface({ input: process.stdin })) {
-  const { facts, rows, changes } = JSON.parse(line), samples = new Samples(facts, true), verdict = new Verdict(new Robot(samples));
+  const { facts, rows, changes, asked } = JSON.parse(line), samples = new Samples(facts, true), verdict = new Verdict(new Robot(samples));
   let causes = [];
   rows.forEach((row, k) => {
     samples.values = new Map([...samples.values, ...Object.entries(changes[k])]);
     samples.append(row);
     if (k % 25 === 0 || k === rows.length - 1) causes = verdict.causes();
   });
-  console.log(JSON.stringify(causes));
+  const { balance } = verdict;
+  console.log(JSON.stringify(asked ? balance[asked.call](...asked.arguments) : causes));
 }

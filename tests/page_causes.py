@@ -1,4 +1,4 @@
-"""The causes that the script of a page names for a run, computed by Node.js."""
+"""The causes that the script of a page names for a run, and its balance of forces, computed by Node.js."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from twodof.pages.arm import RECORDED, arm_of, arm_page
 ROOT = Path(__file__).parents[1]
 
 
-def page_causes(run: twodof.Experiment, samples: Sequence[twodof.Sample]) -> list[dict[str, Any]]:
-    """Return the page's causes after all samples of a run, the root first."""
+def page_causes(run: twodof.Experiment, samples: Sequence[twodof.Sample], call: str = "", *arguments: object) -> Any:
+    """Return the page's causes after all samples of a run, the root first, or what a method of its balance returns."""
     scripts = run_folder() / "page-scripts"
     if not scripts.exists():
         shutil.copytree(ROOT / "fmu_src/page", scripts)
@@ -37,8 +37,8 @@ def page_causes(run: twodof.Experiment, samples: Sequence[twodof.Sample]) -> lis
     inputs = [samples[0].inputs, *(sample.inputs for sample in samples)]
     changes = [{} if new is old else new for old, new in pairwise(inputs)]
     changes[0] = {**run.start_values, **inputs[0]}
-    text = json.dumps({"facts": json.loads(found[1]), "rows": rows, "changes": changes})
+    asked = {"call": call, "arguments": arguments} if call else None
+    text = json.dumps({"facts": json.loads(found[1]), "rows": rows, "changes": changes, "asked": asked})
     command = [needs("node"), str(ROOT / "tests/page_causes.mjs"), scripts.as_uri()]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
-    causes: list[dict[str, Any]] = json.loads(done.stdout)
-    return causes
+    return json.loads(done.stdout)

@@ -9,14 +9,28 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from failures import LARGE_STEPS, fmu_of
+from page_causes import page_causes
 from pytest import approx
 
 import twodof
+from twodof.plant.mechanism import Mechanism
+from twodof.plant.robot import load_robot
 from twodof.simulation.balance import parts_of_error
 
 AWAY: dict[str, Any] = {"q_des": (0.9, 0.8)}
 COARSE = {"control_period": 0.001, "q_resolution": (0.05, 0.05), "v_from_q": True}
 HELD = {"limit_effort": True, "payload": 6.0, "payload_known": True}
+
+
+class Kept(twodof.Sink):
+    """The run and its samples."""
+
+    def begin(self, run: twodof.Experiment) -> Kept:
+        self.run, self.samples = run, list[twodof.Sample]()
+        return self
+
+    def write(self, sample: twodof.Sample) -> None:
+        self.samples.append(sample)
 
 
 @pytest.fixture
@@ -146,3 +160,33 @@ def test_a_joint_without_limits_may_turn_further_than_once() -> None:
     free: dict[str, Any] = {"q_min": (-unbounded, -3.0), "q_max": (unbounded, 3.0)}
     assert not verdict("joint", q_des=(7.0, 0.8), **free).causes
     assert "90°?" in verdict("joint", 20.0, q_des=(90.0, 0.8), **free).lines[0]
+
+
+@pytest.mark.parametrize("robot", ["arm", "panda", "so100"])
+def test_the_inverse_dynamics_of_a_page_are_those_of_pinocchio(robot: str) -> None:
+    kept = Kept()
+    offset: dict[str, Any] = {"payload_com": (0.02, 0.05, -0.03), "gravity": (1.0, 2.0, -9.0), "armature": 0.02}
+    twodof.simulate(fmu_of(robot, "joint"), kept, settings={**LARGE_STEPS, **offset}, stop_time=0.02)
+    fmu = twodof.load_fmu(fmu_of(robot, "joint"))
+    assert fmu.urdf is not None
+    model = load_robot(fmu.urdf, fmu.frame, "xyz")
+    n = len(model.joints)
+    real = Mechanism(model, offset["gravity"], 0.7, offset["payload_com"], [0.02] * n)
+    q, v, a = np.random.default_rng(1).uniform(-1.0, 1.0, (3, n))
+    vectors = [each.tolist() for each in (q, v, a)]
+    found = page_causes(kept.run, kept.samples, "dynamics", *vectors, 0.7)
+    np.testing.assert_allclose(found["tau"], real.inverse_dynamics(q, v, a), rtol=1e-9, atol=1e-12)
+    mass = page_causes(kept.run, kept.samples, "mass", q.tolist(), 0.7)
+    np.testing.assert_allclose(mass, real.mass_matrix(q), rtol=1e-9, atol=1e-12)
+    still = page_causes(kept.run, kept.samples, "dynamics", *vectors[:2], [0.0] * n, 0.7)
+    drift = real.observe(q, v)[2]
+    np.testing.assert_allclose([*still["acceleration"], *still["turning"]], drift, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("control", "settings"), [row[:2] for row in FIRST if row[2] > 1.0])
+def test_a_page_names_the_same_first_cause(control: str, settings: dict[str, Any]) -> None:
+    """Unless the error only needs less time than a page waits."""
+    kept = Kept()
+    made = twodof.simulate(fmu_of("arm", control), kept, settings={**LARGE_STEPS, **settings}).verdict
+    found = page_causes(kept.run, kept.samples)
+    assert made.causes[0].kind in ("time", found[0]["kind"] if found else "")

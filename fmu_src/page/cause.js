@@ -2,19 +2,17 @@
 
 export const MOTION = ["effort", "velocity"];
 export const FOLLOWING = ["limit", "saturation", "singularity"];
-export const STEADY = ["feedforward", "friction", "load"]; // that shift the error about which a motion swings
-export const BEFORE_TIME = ["degrees", "time"];
-export const BEFORE_REACH = ["degrees", "gain", "feedforward", "unstable", "load", "friction"];
 
 /**
  * A cause in words, and its kind, one of those in twodof/simulation/cause.py, with the share of the time or of a limit
- * by which causes of one kind are ranked, and whether it is only a consequence of another one, or of the motion.
+ * by which causes of one kind are ranked, whether it is only a consequence of another one, or of the motion, and the
+ * input or parameter concerned.
  */
-/** @typedef {{kind: string, text: string, share: number, joint: number, noted: boolean}} Cause */
+/** @typedef {{kind: string, text: string, share: number, joint: number, noted: boolean, subject: string}} Cause */
 
-/** @type {(kind: string, text: string, share?: number, joint?: number) => Cause} */
-export function cause(kind, text, share = 0, joint = -1) {
-  return { kind, text, share, joint, noted: false };
+/** @type {(kind: string, text: string, share?: number, joint?: number, subject?: string) => Cause} */
+export function cause(kind, text, share = 0, joint = -1, subject = "") {
+  return { kind, text, share, joint, noted: false, subject };
 }
 
 /** A number with four digits. */

@@ -3,7 +3,6 @@
 /** @typedef {import("./samples.js").Samples} Samples */
 
 export const GAINS = [["Kp", "Kd"], ["Kp_rot", "Kd_rot"]]; // of position or joints, and of orientation
-const SHIFTED = 0.3; // ratio of the extremes of an error to both sides, below which it is shifted
 const SWINGING = 0.7; // damping ratio below which an error that shrinks once will grow again
 const SQUARINGS = 24; // of the loop's matrix A: the norm of A^(2^24), to the power 2^-24, is its spectral radius
 
@@ -53,16 +52,6 @@ export function slowest(session, i) {
 export function swing(session, i) {
   const [Kp, Kd] = GAINS[i].map((group) => session.held(group));
   return Math.min(...Kp.map((p, n) => (p > 0 && Kd[n] < SWINGING * 2 * Math.sqrt(p) ? Kd[n] / 2 : Infinity)));
-}
-
-/** Whether the error of position or joints passes zero to and fro in these samples, hardly shifted to one side. */
-/** @type {(session: Samples, samples: number[]) => boolean} */
-export function swings(session, samples) {
-  const [now, wanted] = session.follows ?? ["", ""], target = session.held(wanted);
-  const e = samples.map((k) => target.map((value, i) => value - session.value(now, k, i)));
-  const sizes = e.map((each) => Math.hypot(...each)), most = e[sizes.indexOf(Math.max(...sizes))] ?? [];
-  const along = e.map((each) => each.reduce((sum, value, i) => sum + value * most[i], 0));
-  return Math.min(...along) < -SHIFTED * Math.max(...along);
 }
 
 /** Names and values of the gains of each loop; that of the self-motion has no stiffness, and moves only redundant arms. */

@@ -21,6 +21,10 @@ interface Link {
   column: number;
   ratio: number;
   offset: number;
+  mass: number;
+  /** The centre of mass, and the inertia about it by rows, in the link's axes. */
+  com: number[];
+  inertia: number[];
 }
 
 /** A variable of the FMU. */

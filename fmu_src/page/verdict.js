@@ -1,8 +1,10 @@
 /** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
-import { BEFORE_REACH, BEFORE_TIME, FOLLOWING, MOTION, STEADY, cause, forceUnit, short, speedUnit } from "./cause.js";
-import { GAINS, decay, loops, slowest, spectralRadius, swing, swings } from "./sampled_loop.js";
-import { Search, off, solved, squared } from "./search.js";
+import { Balance } from "./balance.js";
+import { MOTION, cause, forceUnit, short, speedUnit } from "./cause.js";
+import { LASTING, MOVING, SMALL, byKinds, byParts, weight } from "./ranking.js";
+import { GAINS, decay, loops, slowest, spectralRadius, swing } from "./sampled_loop.js";
+import { Search } from "./search.js";
 
 /** @typedef {import("./cause.js").Cause} Cause @typedef {import("./robot.js").Robot} Robot */
 
@@ -12,7 +14,7 @@ const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the shar
 const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
 const STILL = 1e-3, CREEPING = 1e-5, FEWEST = 0.2; // part of the largest speed, and rad/s or m/s, at rest; damping ratio
 const TAIL = 256, FAST = 0.25, FADING = 0.7; // examined last samples, reversals in a step that are too many, and decay of the speed
-const SLIGHT = 1e-4, DRAG = 0.02, EXPLAINED = 0.1; // loads and efforts of damping, relative to the largest effort; as in causes.py
+const SLIGHT = 1e-4, DRAG = 0.02, BALANCED = 9; // loads and efforts of damping, relative to the largest effort; samples of the balance
 const UNSTABLE = 1 + 1e-4, SPOILT = 0.5; // spectral radius, and rate of decay relative to that of a continuous controller
 
 export class Verdict {
@@ -26,6 +28,7 @@ export class Verdict {
     this.robot = robot;
     this.joints = robot.facts.joints;
     this.search = new Search(robot);
+    this.balance = new Balance(robot, this.search);
   }
 
   /** @returns {string[]} Lines of the verdict at the latest sample. */
@@ -65,47 +68,32 @@ export class Verdict {
     const missed = this.missed(), found = [...this.degrees(), ...this.beyond()];
     const waited = session.time(last) - session.time(this.began) >= SETTLE;
     if (missed.includes(true)) found.push(...this.reach(missed[0], waited), ...this.gains(missed), ...this.atLimits());
+    const parts = missed.includes(true) && waited ? this.balance.parts(this.late(), missed) : new Map();
     if (missed.includes(true) && waited) {
-      const loads = this.loads(), sticking = this.friction(loads.some(({ kind }) => kind === "load"));
-      const slow = sticking.length && !this.vanishing() ? [] : this.slow(missed); // else the rate of an error tells nothing
-      found.push(...loads, ...sticking, ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
-      found.push(...this.damping(missed), ...this.singular(), ...slow);
+      found.push(...this.loads(), ...this.friction(parts), ...this.saturated(), ...this.feedforward(missed), ...this.sampled());
+      found.push(...this.damping(missed), ...this.singular(), ...this.slow(missed));
+      const restless = Math.max(weight("time", "", parts), Math.abs(parts.get("sampling ") ?? 0));
+      if (restless > LASTING && !found.some(({ kind }) => MOVING.includes(kind))) found.push(...this.unsettled());
     }
-    return this.ranked(found);
+    return this.ranked(found, missed, parts);
   }
 
-  /** Causes in the order of their kinds; a joint at a limit is last if another cause drives it there. */
-  /** @type {(found: Cause[]) => Cause[]} */
-  ranked(found) {
-    const order = this.robot.facts.causes, driven = found.some(({ kind }) => kind === "limit") ? this.driven() : [];
-    const pushed = found.some(({ kind, share }) => kind === "load" && share > DRAG); // perhaps to a limit
-    const motors = Math.max(0, ...found.filter(({ kind }) => kind === "saturation").map(({ share }) => share));
-    /** @type {(cause: Cause) => boolean} */
-    const passing = ({ kind, share, joint }) => kind === "limit" && (share < motors || driven[joint]);
-    /** @type {(cause: Cause) => number} */
-    const rank = (each) => order.indexOf(passing(each) ? "drag" : each.kind === "limit" && pushed ? "load" : each.kind) + 0.5 * Number(each.kind === "limit");
-    const swinging = found.some(({ kind }) => kind === "damping") && swings(this.session, this.picked(0.5)), fades = found.some(({ kind }) => kind === "time") && this.vanishing(), [error] = this.errors(this.session.count - 1), near = found.some(({ kind, share }) => kind === "reach" && error > 2 * share);
-    /** @type {(cause: Cause) => number} */
-    const first = ({ kind }) => Number((near && !BEFORE_REACH.includes(kind)) || (fades && !BEFORE_TIME.includes(kind)) || (swinging && STEADY.includes(kind)));
-    const [root, ...others] = found.sort((a, b) => first(a) - first(b) || rank(a) - rank(b) || b.share - a.share);
-    const leads = ["degrees", "unstable", "sampling"].includes(root?.kind) || (root?.kind === "reach" && error - root.share <= EXPLAINED * root.share);
-    if (root) root.noted = MOTION.includes(root.kind) && this.missed().includes(true); // a peak makes no error
-    for (const each of others) each.noted = passing(each) || MOTION.includes(each.kind) || (leads && FOLLOWING.includes(each.kind));
-    const stands = others.some(({ kind, noted }) => kind === "limit" && noted);
-    for (const each of others) each.noted ||= stands && each.kind === "singularity";
-    return found;
+  /** Causes by their parts in the error, which the balance of forces gives after some time. */
+  /** @type {(found: Cause[], missed: boolean[], parts: Map<string, number>) => Cause[]} */
+  ranked(found, missed, parts) {
+    const order = this.robot.facts.causes, far = Math.max(0, ...found.filter(({ kind }) => kind === "reach").map(({ share }) => share));
+    const size = Math.sqrt(this.late().reduce((sum, k) => sum + this.errors(k)[0] ** 2, 0) / this.late().length);
+    const last = this.session.count - 1, passed = this.session.time(last) - this.session.time(this.began);
+    const reach = far / Math.max(size, FLOOR) / missed.filter(Boolean).length;
+    const ranked = parts.size ? byParts(found, parts, order, { reach, passed }) : byKinds(found, order);
+    if (ranked.length) ranked[0].noted = MOTION.includes(ranked[0].kind) && missed.includes(true); // a peak makes no error
+    return ranked;
   }
 
-  /** Whether the controller pulls each joint away from the nearer limit. */
-  driven() {
-    const { session } = this, q = [...session.at("q")], wanted = session.held("q_des");
-    let pull = wanted.length ? off(wanted, q) : q.map(() => 0);
-    if (session.groups.has("x_des") && !session.groups.has("quat_des")) {
-      const J = this.search.jacobian(q), size = J.flat().reduce((sum, value) => sum + value * value, 1e-18);
-      const y = solved(squared(J, SINGULAR * SINGULAR * size), off(session.held("x_des"), this.search.pointOf(q)));
-      pull = J.map((row) => row.reduce((sum, value, a) => sum + value * y[a], 0));
-    }
-    return q.map((value, i) => (2 * value > this.search.limits(i)[0] + this.search.limits(i)[1] ? pull[i] < 0 : pull[i] > 0));
+  /** Some samples of the last quarter of the time since the last change of the target. */
+  late() {
+    const late = this.picked(0.25), stride = Math.ceil(late.length / BALANCED);
+    return late.filter((_, i) => (late.length - 1 - i) % stride === 0);
   }
 
   /** @type {(k: number) => number[]} Errors in sample k of position or joints, and of orientation; 0 without a target. */
@@ -196,7 +184,7 @@ export class Verdict {
   feedforward(missed) {
     const rates = [["xd_des", "xdd_des", "v_des", "a_des"], ["omega_des", "alpha_des"]];
     return rates.flatMap((groups, k) => (missed[k] ? groups : [])).filter((group) => this.session.held(group).some(Boolean)).map((group) =>
-      cause("feedforward", `${group} = (${this.session.held(group).map(short).join(", ")}) is not 0, while the target rests`));
+      cause("feedforward", `${group} = (${this.session.held(group).map(short).join(", ")}) is not 0, while the target rests`, 0, -1, group));
   }
 
   atLimits() {
@@ -209,18 +197,15 @@ export class Verdict {
     });
   }
 
-  /** Joints that stick; small friction also holds a joint where an unknown load balances the controller. */
-  /** @type {(loaded: boolean) => Cause[]} */
-  friction(loaded) {
-    const { session } = this, stopped = this.robot.stopped(session.now), driven = stopped.length ? this.driven() : [];
-    const lengths = this.search.jacobian([...session.at("q")], [...session.axes, ...(session.groups.has("quat_des") ? [3, 4, 5] : [])]).map((row) => Math.hypot(...row));
+  /** Joints that stick, or whose friction has a part in the error. */
+  /** @type {(parts: Map<string, number>) => Cause[]} */
+  friction(parts) {
+    const { session } = this;
     return session.held("friction").flatMap((size, i) => {
-      if (stopped.includes(this.joints[i]) && !driven[i]) return [];
-      const least = loaded ? DRAG * Math.max(...this.picked(0.25).map((k) => Math.abs(session.value("tau", k, i)))) : 0;
-      const [still, late] = size > least ? this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING) : [0, 0];
-      const moves = !session.groups.has("x_des") || lengths[i] > 1e-6 * Math.max(...lengths);
-      const astray = !session.groups.has("q_des") || Math.abs(session.value("q", session.count - 1, i) - session.held("q_des")[i]) > FLOOR;
-      return late > 0.9 && astray && moves ? [cause("friction", `joint '${this.joints[i].name}' sticks: its friction of ${short(size)} ${forceUnit(this.joints[i])} holds it`, still, i)] : [];
+      const [still, late] = this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING), sticks = late > 0.9;
+      const counts = parts.size ? Math.abs(parts.get(`friction ${i}`) ?? 0) >= SMALL : sticks;
+      const text = `joint '${this.joints[i].name}' ${sticks ? "sticks" : "creeps"}: its friction of ${short(size)} ${forceUnit(this.joints[i])} ${sticks ? "holds it" : "slows it down"}`;
+      return size > 0 && counts ? [cause("friction", text, sticks ? still : 0, i)] : [];
     });
   }
 
@@ -248,14 +233,14 @@ export class Verdict {
     const { session } = this, { values } = session, found = [], unknown = "the controller does not know the";
     const payload = Number(values.get("payload") ?? 0), most = Math.max(...this.picked().flatMap((k) => [...session.at("tau", k)].map(Math.abs)), 1e-300);
     if (payload * 9.81 > SLIGHT * most && values.get("payload_known") !== true)
-      found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, (payload * 9.81) / most));
+      found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, (payload * 9.81) / most, -1, "payload"));
     for (const group of ["tau_ext", "f_ext"])
       if (session.held(group).some((value) => Math.abs(value) > SLIGHT * most))
-        found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, Math.max(...session.held(group).map(Math.abs)) / most));
+        found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, Math.max(...session.held(group).map(Math.abs)) / most, -1, group));
     /** @type {(own: (damping: number, i: number) => boolean) => string[]} */
     const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
     const heavy = damped((size, i) => size > 2 * this.joints[i].damping), some = damped((size) => size > 0);
-    if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 1));
+    if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 1, -1, "damping"));
     else if (some.length && this.drags()) found.push(cause("drag", `${unknown} damping of joints ${some.join(", ")} in the URDF`));
     return found;
   }
@@ -288,10 +273,11 @@ export class Verdict {
     const unstable = loops(session, joints.length).flatMap(([stiff, damp, Kp, Kd], k) => {
       const radii = Kp.map((p, i) => spectralRadius(p, Kd[i], period, delay, differences)), radius = Math.max(...radii);
       const i = radii.indexOf(radius), rate = -Math.log(radius) / period, gains = [stiff && this.gain(stiff, i), this.gain(damp, i)].filter(Boolean);
+      if (stiff && Kd[i] < FEWEST * 2 * Math.sqrt(Kp[i]) && -Math.log(BAND) / decay(Kp[i], Kd[i]) > 2 * PATIENCE) return []; // it lacks damping
       const slow = stiff && rate < SPOILT * decay(Kp[i], Kd[i]) && -Math.log(BAND) > PATIENCE * rate;
       const text = `${gains.join(" and ")} ${stiff ? "are" : "is"} too high for ${settings()}: the loop${stiff ? "" : " of the self-motion"} is`;
       if ((loaded && (rests || falls[k])) || !(radius > UNSTABLE || slow)) return [];
-      return [cause("unstable", `${text} ${radius > UNSTABLE ? "unstable" : "close to unstable"}`)];
+      return [cause("unstable", `${text} ${radius > UNSTABLE ? "unstable" : "close to unstable"}`, -rate)];
     });
     if (unstable.length) return unstable;
     const turns = joints.map((_, i) => {
@@ -324,14 +310,15 @@ export class Verdict {
     return near ? [cause("singularity", "the arm is near a singularity")] : [];
   }
 
-  /** Whether each error shrinks as the gains let it, and to less than half of its last value, as a geometric sequence. */
-  vanishing() {
-    const late = this.picked(0.25), passed = this.session.time(late[late.length - 1]) - this.session.time(late[0]);
-    const three = [late[0], late[(late.length - 1) >> 1], late[late.length - 1]].map((k) => this.errors(k));
-    return this.missed().every((is, i) => {
-      const [before, middle, last] = three.map((errors) => errors[i]), bend = before - 2 * middle + last;
-      return !is || (swing(this.session, i) === Infinity && Math.log(before / last) >= SPOILT * slowest(this.session, i) * passed && !(bend > 0 && last - (last - middle) ** 2 / bend > 0.5 * last));
-    });
+  /** The reason of an error that moves, and neither decays steadily nor lacks damping. */
+  unsettled() {
+    const { session } = this, rates = [0, 1].map((i) => slowest(session, i)), last = session.count - 1;
+    const left = -Math.log(BAND) / Math.min(...rates) - (session.time(last) - session.time(this.began));
+    const settings = ["control_period", "control_delay"].filter((name) => Number(session.values.get(name) ?? 0) > 0);
+    if (left > PATIENCE) return [cause("time", `with these gains an error takes about ${short(left)} s more to 2 %`, left)];
+    const coarse = this.joints.flatMap((_, i) => ["q_resolution", "q_noise", "v_noise"].map((name) => `${name}[${i + 1}]`)).filter((name) => Number(session.values.get(name) ?? 0) > 0);
+    if (coarse.length) return [cause("sampling", `the controller measures with ${coarse[0]} = ${short(Number(session.values.get(coarse[0])))}: it does not see smaller errors`)];
+    return left <= 0 && settings.length ? [cause("sampling", `the motion does not settle: ${settings.join(" and ")} make the efforts too late`)] : [];
   }
 
   /** Errors that still shrink, with the remaining time by their rate. */

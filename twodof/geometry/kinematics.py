@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..plant.urdf import Joint, RobotError, Urdf, read_urdf
+from ..plant.urdf import INERTIA, Joint, RobotError, Urdf, attribute, read_urdf, vector
 
 Array = NDArray[np.float64]
 BLOCK = 10_000  # samples whose arrays fit into the cache
@@ -38,6 +38,14 @@ class Placement(NamedTuple):
         """Compose two transforms."""
         translation = self.translation + rotated(self.rotation, inner.translation)
         return Placement(translation, self.rotation @ inner.rotation)
+
+
+class Body(NamedTuple):
+    """A link's mass, kg, its centre, m, and the inertia about it, kg·m², 9 values by rows, in the link's axes."""
+
+    mass: float
+    com: list[float]
+    inertia: list[float]
 
 
 def quaternions(rotation: Array) -> Array:
@@ -66,6 +74,19 @@ class Kinematics:
         self.urdf = urdf
         self._columns = {name: i for i, name in enumerate(joints)}
         self.origins = {joint.name: Rotation.from_euler("xyz", joint.rpy).as_matrix() for joint in urdf.joints.values()}
+
+    def body(self, link: str) -> Body:
+        """Return the inertia of a link; zeros if the URDF has none."""
+        element = next(each for each in self.urdf.tree.findall("link") if each.get("name") == link)
+        inertial = element.find("inertial")
+        if inertial is None:
+            return Body(0.0, [0.0] * 3, [0.0] * 9)
+        origin = inertial.find("origin")
+        xx, xy, xz, yy, yz, zz = (attribute(inertial, "inertia", key, 0.0) for key in INERTIA)
+        turn = Rotation.from_euler("xyz", vector(origin, "rpy", (0.0, 0.0, 0.0))).as_matrix()
+        inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+        com = vector(origin, "xyz", (0.0, 0.0, 0.0))
+        return Body(attribute(inertial, "mass", "value", 0.0), [*com], inertia.ravel().tolist())
 
     def moves(self, joint: Joint) -> bool:
         """Return whether a joint's position depends on q."""

@@ -252,6 +252,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], 
                 "column": -1 if column is None else column,
                 "ratio": ratio,
                 "offset": offset,
+                **kinematics.body(joint.child)._asdict(),
             }
         )
     return links, number

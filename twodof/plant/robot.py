@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from .numerals import number
-from .urdf import NUMERIC_TAGS, UNBOUNDED, Joint, RobotError, Urdf, attribute, check_axes, read_urdf
+from .urdf import INERTIA, NUMERIC_TAGS, UNBOUNDED, Joint, RobotError, Urdf, attribute, check_axes, read_urdf
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
     mass = attribute(inertial, "mass", "value", 0.0)
     if mass < 0.0:
         raise RobotError(f"link '{link}': negative mass {mass:g} kg")
-    xx, xy, xz, yy, yz, zz = (attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS)
+    xx, xy, xz, yy, yz, zz = (attribute(inertial, "inertia", key, 0.0) for key in INERTIA)
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     slack = 1e-6 * float(np.abs(moments).sum()) + 1e-15  # URDFs are written with few digits
     if moments[2] > moments[0] + moments[1] + slack:
@@ -211,12 +211,9 @@ def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
     return mass
 
 
-_INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-
-
 def _missing(inertial: ET.Element) -> str:
     """Return the first element with missing attributes, and these attributes; "" if there is none."""
-    for tag, keys in (("mass", ("value",)), ("inertia", _INERTIA_KEYS)):
+    for tag, keys in (("mass", ("value",)), ("inertia", INERTIA)):
         element = inertial.find(tag)
         missing = [key for key in keys if element is None or element.get(key) is None]
         if missing:

@@ -17,6 +17,7 @@ UNBOUNDED = 1.7976931348623157e308
 
 NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 SHAPES = ("visual", "collision")
 MAX_URDF = 8 * 1024**2  # bytes of a file, or characters of a text
 MAX_LINKS = 1000
@@ -200,7 +201,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
     for key, value in (("effort", effort), ("damping", damping), ("friction", friction)):
         if kind != "fixed" and value < 0:
             raise RobotError(f"joint '{name}': negative {key}")
-    axis = _vector(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
+    axis = vector(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
     length = math.hypot(*axis)
     if kind == "fixed":
         axis, length = (1.0, 0.0, 0.0), 1.0
@@ -213,8 +214,8 @@ def _joint(name: str, element: ET.Element) -> Joint:
         type=kind,
         parent=_link(element, "parent"),
         child=_link(element, "child"),
-        xyz=_vector(origin, "xyz", (0.0, 0.0, 0.0)),
-        rpy=_vector(origin, "rpy", (0.0, 0.0, 0.0)),
+        xyz=vector(origin, "xyz", (0.0, 0.0, 0.0)),
+        rpy=vector(origin, "rpy", (0.0, 0.0, 0.0)),
         axis=(x, y, z),
         low=low,
         high=high,
@@ -336,7 +337,8 @@ def attribute(element: ET.Element, tag: str, key: str, default: float) -> float:
     return max(-UNBOUNDED, min(UNBOUNDED, value))
 
 
-def _vector(element: ET.Element | None, key: str, default: Vector) -> Vector:
+def vector(element: ET.Element | None, key: str, default: Vector) -> Vector:
+    """Return three numbers of an attribute."""
     if element is None or element.get(key) is None:
         return default
     x, y, z = (float(word) for word in str(element.get(key)).split())
