@@ -3,6 +3,7 @@
 MCAP files are made record by record by the specification. test_hostile_bags.py tests time and memory.
 """
 
+import json
 import sqlite3
 import struct
 import tracemalloc
@@ -330,3 +331,20 @@ def test_hostile_provenance_is_refused(native_path, tmp_path, content, capsys):
         sink.write(sample(run, 0))
     (bag / "run.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     assert "run.json" in refused(capsys, bag)
+
+
+@pytest.mark.parametrize("output", ["x.html", "x.png"])
+def test_a_provenance_may_have_half_characters_and_more_facts(native_path, tmp_path, output, capsys):
+    bag = tmp_path / "bag"
+    twodof.run(native_path, twodof.Bag(bag), stop_time=0.1)
+    facts = json.loads((bag / "run.json").read_text())
+    facts["fmu"]["file"] = facts["command_line"] = "\ud800 and \U0001f600"
+    facts["verdict"]["later"] = facts["verdict"]["lines"] = ["half a \udc00"]
+    facts["verdict"]["causes"] = [
+        {"kind": "", "text": "", "joint": "", "share": 0, "point": [], "noted": True, "subject": "", "later": 1}
+    ]
+    (bag / "run.json").write_text(json.dumps(facts))
+    assert main(["plot", str(bag), "-o", str(tmp_path / output)]) == 0
+    assert main(["info", str(bag)]) == 0
+    said = capsys.readouterr().out
+    assert "? and \U0001f600" in said and "half a ?" in said
