@@ -8,7 +8,7 @@ import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 import lz4.frame
@@ -196,11 +196,13 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
 
 
 def test_joint_states_that_are_decoded_one_by_one_are_limited(bag, monkeypatch):
-    """They differ in frame; each takes 20 µs, and with many names milliseconds."""
-    frames = [serialised(joint_message(t, ["a", "b"], [0.0, 1.0], frame="x" * (t % 2))) for t in range(40)]
-    (bag / "bag.mcap").write_bytes(TOPIC + b"".join(message(data, t) for t, data in enumerate(frames)) + FOOTER)
-    assert len(twodof.read_bag(bag).t) == 40
-    monkeypatch.setattr(reader, "MAX_ODD", 1000)
+    """Frames of one length differ; each message takes 20 µs, and with many names milliseconds."""
+    monkeypatch.setattr(reader, "MAX_ODD", 2000)
+    for frames in ("", "longer"), ("", "x"):
+        data = [serialised(joint_message(t, ["a", "b"], [0.0, 1.0], frame=frames[t % 2])) for t in range(40)]
+        (bag / "bag.mcap").write_bytes(TOPIC + b"".join(map(message, data, range(40))) + FOOTER)
+        if "longer" in frames:
+            assert len(twodof.read_bag(bag).t) == 40
     with pytest.raises(BagError, match="MiB of joint states of changing form"):
         twodof.read_bag(bag)
 
@@ -265,6 +267,20 @@ def test_mcap_of_a_robot_at_rest_is_read_at_any_length(tmp_path, what, compressi
     (tmp_path / "x.mcap").write_bytes(TOPIC + packed + FOOTER)
     found = read_messages(tmp_path / "x.mcap", ReadBudget(left=10_000))
     assert np.concatenate([stamps for _, stamps, _ in found]).tolist() == stamps
+
+
+def test_messages_of_varying_lengths_are_read_in_few_batches(tmp_path):
+    """Lengths alternate, repeat in a longer period, and come at random; a batch takes 20 µs."""
+    file, rng = tmp_path / "x.mcap", np.random.default_rng(1)
+    patterns = [0, 1] * 500, [0, 0, 1] * 300, [0, 1, 1, 0, 2] * 200, [*rng.integers(0, 4, 1000)], [2] * 40 + [1] * 40
+    lengths = [int(size) for size in chain(*patterns)]
+    written = [message(bytes([k % 251]) * size, k, number=1 + k % 7 // 6) for k, size in enumerate(lengths)]
+    file.write_bytes(TOPIC + channel(2, "/x") + chunk(b"".join(written), sum(map(len, written)), "") + FOOTER)
+    batches = [*read_messages(file, ReadBudget())]
+    found = [(t, rows[i]) for _, stamps, rows in batches for i, t in enumerate(stamps.tolist())]
+    assert [k for k, _ in sorted(found, key=lambda each: each[0])] == [*range(len(lengths))]
+    assert all(row.tobytes() == bytes([k % 251]) * lengths[k] for k, row in found)
+    assert len(batches) < 40
 
 
 @pytest.mark.parametrize("read", [read_bag, read_ends])

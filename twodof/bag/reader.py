@@ -253,18 +253,14 @@ class _JointStates:
             raise BagError(f"'{self._path}' has a joint state of {messages.shape[1]} bytes")
         message = messages[0].tobytes()
         try:
-            if self._layout is None:
-                frame, self.names, *parts = _deserialised(message)
-                self._sizes = tuple(map(len, parts))
-                self._layout = joint_state_layout(self.names, frame, self._sizes)
-            numbers = self._layout.unpack(messages)
+            numbers = None if self._layout is None else self._layout.unpack(messages)
             if numbers is None:
-                self._odd += messages.nbytes
-                if self._odd > MAX_ODD:
-                    raise BagError(
-                        f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form"
-                    )
-                numbers = [np.array(part, np.float64) for part in zip(*map(self._decode_one, messages), strict=True)]
+                frame, _ = self._decode_one(messages[0])
+                self._layout = joint_state_layout(self.names, frame, self._sizes)
+                numbers = self._layout.unpack(messages)
+            if numbers is None:
+                parts = zip(*(self._decode_one(each)[1] for each in messages), strict=True)
+                numbers = [np.array(part, np.float64) for part in parts]
             return numbers
         except BagError:
             raise
@@ -275,14 +271,20 @@ class _JointStates:
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
 
-    def _decode_one(self, message: Rows) -> list[Array]:
-        """Decode a message whose frame, byte order or padding differs from the first one's."""
-        _, names, *parts = _deserialised(message.tobytes())
+    def _decode_one(self, message: Rows) -> tuple[str, list[Array]]:
+        """Return the frame and the numbers of a message, whose joints must be the first one's."""
+        self._odd += message.nbytes
+        if self._odd > MAX_ODD:
+            raise BagError(f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form")
+        frame, names, *parts = _deserialised(message.tobytes())
+        sizes = tuple(map(len, parts))
+        if not self._sizes:
+            self.names, self._sizes = names, sizes
         if names != self.names:
             raise MixtureError("joints")
-        if tuple(map(len, parts)) != self._sizes:
+        if sizes != self._sizes:
             raise MixtureError("sizes")
-        return parts
+        return frame, parts
 
 
 def _deserialised(message: bytes) -> tuple[Any, ...]:
