@@ -8,6 +8,7 @@ import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from bags import (
 )
 
 import twodof
-from twodof.bag import reader
+from twodof.bag import joint_states, reader
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.records import DamageError, ReadBudget
@@ -197,7 +198,7 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
 
 def test_joint_states_that_are_decoded_one_by_one_are_limited(bag, monkeypatch):
     """Frames of one length differ; each message takes 20 µs, and with many names milliseconds."""
-    monkeypatch.setattr(reader, "MAX_ODD", 2000)
+    monkeypatch.setattr(joint_states, "MAX_ODD", 2000)
     for frames in ("", "longer"), ("", "x"):
         data = [serialised(joint_message(t, ["a", "b"], [0.0, 1.0], frame=frames[t % 2])) for t in range(40)]
         (bag / "bag.mcap").write_bytes(TOPIC + b"".join(map(message, data, range(40))) + FOOTER)
@@ -302,6 +303,23 @@ def test_large_records_outside_chunks_are_read_one_after_another(bag):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 80 * 1024**2
+
+
+def test_a_provenance_is_evaluated_once_however_often_samples_are_chosen(bag, monkeypatch):
+    """One of some megabytes takes a second."""
+    (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) * 60_000 + FOOTER)
+    given = {"start_time": 0.0, "step": 0.01, "start_values": {"a": 0.0}, "input_changes": [[0.0, {"a": 1.0}]]}
+    readings, schedules = count(), []
+    monkeypatch.setattr(reader, "read_provenance", lambda *where: next(readings) or given)
+
+    def lines(part):
+        schedules.append(part.schedule[0][1])
+        assert replace(part, q=part.q).schedule[0][1] is schedules[0]
+        return [part.held("a", 1)]
+
+    drawn = reader.read_downsampled(bag, 1000, lines)
+    assert len(schedules) > 5 and {*map(id, [*schedules, drawn.schedule[0][1]])} == {id(schedules[0])}
+    assert next(readings) == 1
 
 
 def test_joint_states_in_memory_are_bounded(bag, monkeypatch):

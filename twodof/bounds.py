@@ -74,6 +74,7 @@ MAX_METADATA = 64 * MIB
 MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much memory
 MAX_PROVENANCES = 64 * MIB  # of all robots of a bag, which a recovery holds
 MAX_HELD = 5_000_000  # input values, summed over all changes of inputs
+CHANGE = 8  # input values for which a change counts besides its own, by its memory; a table of MAX_CELLS has room
 MAX_JOINT_STATE = 64 * KIB  # a message; a thousand joints
 MAX_ODD = 128 * MIB  # joint states that differ in frame, byte order or padding, which takes seconds
 MAX_SAMPLES = 2048 * MIB  # joint states in memory; a day of 7 joints at 100 Hz takes 1450 MiB

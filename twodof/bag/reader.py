@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import logging
-import struct
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_ODD, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
+from ..bounds import MAX_DRAWN, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
 from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
-from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
-from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
+from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET
 from .contents import read_messages, stated_count, storage_files
-from .downsampling import Downsampler, Indices
+from .downsampling import Downsampler
+from .joint_states import Ends, JointStates, Targets
 from .provenance import file_of, read_provenance, robot_in, robots_of
-from .recording import Array, ReceivedTargets, Recording, TopicCount
-from .records import DamageError, ReadBudget, Stamps
+from .recording import Array, Inputs, Recording, TopicCount
+from .records import DamageError, ReadBudget
 from .summary import read_summary
-
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 LOG = logging.getLogger(__name__)
 
@@ -39,7 +33,7 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: the path is not a bag, or the bag is unfinished, damaged or without joint states.
     """
-    return _read(path_of(path, "bag"), _JointStates, _Targets())
+    return _read(path_of(path, "bag"), JointStates, Targets())
 
 
 def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
@@ -48,7 +42,7 @@ def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], S
     Memory holds at most ``most`` samples and a chunk of the bag. ``lines`` returns the curves of a part of the bag that
     are drawn in addition to positions and velocities; its exceptions are passed on.
     """
-    return _read(Path(path), _JointStates, _Targets(), Downsampler(most, lines))
+    return _read(Path(path), JointStates, Targets(), Downsampler(most, lines))
 
 
 def read_ends(path: str | Path) -> Recording:
@@ -64,7 +58,7 @@ def read_ends(path: str | Path) -> Recording:
     with _refusing(folder):
         summaries = [read_summary(file) for file in whole_bag(folder)]
         if None in summaries:
-            return _read(path, _Ends, None)
+            return _read(path, Ends, None)
         counts: Counter[tuple[str, str]] = Counter()
         total = 0
         for summary in filter(None, summaries):
@@ -76,14 +70,14 @@ def read_ends(path: str | Path) -> Recording:
         stating = [topic for topic, kind in counts if kind == JOINT_STATE]
         usual = prefix + JOINT_STATES
         if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
-            return _read(path, _Ends, None)
+            return _read(path, Ends, None)
         chosen = usual if usual in stating else "".join(stating)
-        ends, budget = _Ends(path), ReadBudget()
+        ends, budget = Ends(path), ReadBudget()
         for summary in filter(None, summaries):
             for batch in summary.ends(chosen, budget):
                 ends.add(batch.stamps, batch.messages)
         _check_count(folder, total)
-        return _recording(path, counts, chosen, ends, None)
+        return _recording(path, counts, chosen, ends, None, lambda: Inputs(read_provenance(*robot_in(path))))
 
 
 def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
@@ -113,15 +107,17 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 def _read(
-    path: Path, kind: type[_JointStates], targets: _Targets | None, downsampler: Downsampler | None = None
+    path: Path, kind: type[JointStates], targets: Targets | None, downsampler: Downsampler | None = None
 ) -> Recording:
     """Read a bag's joint states with the given accumulator, and downsample them."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states, total = "", kind(path), 0
     budget, thinned, most = ReadBudget(), False, MAX_SAMPLES
 
+    inputs = cache(lambda: Inputs(read_provenance(*robot_in(path))))
+
     def thin(downsampler: Downsampler) -> None:
-        states.keep(downsampler.choose(_recording(path, counts, chosen, states, targets)))
+        states.keep(downsampler.choose(_recording(path, counts, chosen, states, targets, inputs)))
 
     folder, prefix, others = _place(path)
     with _refusing(folder):
@@ -158,7 +154,7 @@ def _read(
         )
     if downsampler is not None and thinned:
         thin(downsampler)  # downsample the end like the rest
-    return _recording(path, counts, chosen, states, targets)
+    return _recording(path, counts, chosen, states, targets, inputs)
 
 
 def _check_count(path: Path, count: int) -> None:
@@ -172,7 +168,12 @@ def _check_count(path: Path, count: int) -> None:
 
 
 def _recording(
-    path: Path, counts: Counter[tuple[str, str]], chosen: str, states: _JointStates, targets: _Targets | None
+    path: Path,
+    counts: Counter[tuple[str, str]],
+    chosen: str,
+    states: JointStates,
+    targets: Targets | None,
+    inputs: Callable[[], Inputs],
 ) -> Recording:
     if not counts[chosen, JOINT_STATE]:
         _, robot = robot_in(path)
@@ -189,7 +190,8 @@ def _recording(
         v=v,
         tau=tau,
         received=targets.received(stamps) if targets is not None else None,
-        provenance=read_provenance(*robot_in(path)),
+        provenance=inputs().provenance,
+        inputs=inputs(),
     )
 
 
@@ -204,145 +206,3 @@ def whole_bag(path: Path) -> list[Path]:
             raise BagError(f"the bag '{path}' is still being written")
         raise BagError(f"the bag '{path}' is unfinished: its writer died; repair it with 'twodof recover {path}'")
     return files
-
-
-class _JointStates:
-    """Joint states of one topic, decoded incrementally."""
-
-    def __init__(self, path: Path) -> None:
-        self.names: tuple[str, ...] = ()
-        self._path = path
-        self._layout: Layout | None = None
-        self._sizes: tuple[int, ...] = ()
-        self._odd = 0  # bytes that were decoded one by one
-        self._stamps = array("q")
-        self._numbers = [array("d") for _ in range(3)]
-
-    def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add N joint states."""
-        numbers = self._decoded(messages)
-        self._stamps.frombytes(stamps.tobytes())
-        for stored, part in zip(self._numbers, numbers, strict=True):
-            stored.frombytes(part.tobytes())
-
-    def __len__(self) -> int:
-        return len(self._stamps)
-
-    @property
-    def size(self) -> int:
-        """Bytes of all states."""
-        return 8 * (len(self._stamps) + sum(map(len, self._numbers)))
-
-    def keep(self, chosen: Indices) -> None:
-        """Keep only the states at these indices of the arrays that ``arrays`` returns."""
-        stamps, *numbers = self.arrays()
-        self._stamps = array("q", stamps[chosen].tobytes())
-        self._numbers = [array("d", part[chosen].tobytes()) for part in numbers]
-
-    def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Return stamps, positions, velocities and efforts by ascending stamps."""
-        stamps = np.asarray(self._stamps)
-        q, v, effort = (np.asarray(n).reshape(len(stamps), -1) for n in self._numbers)
-        if np.any(np.diff(stamps) < 0):
-            order = np.argsort(stamps, kind="stable")
-            stamps, q, v, effort = stamps[order], q[order], v[order], effort[order]
-        return stamps, q, v, effort
-
-    def _decoded(self, messages: Rows) -> list[Array]:
-        if messages.shape[1] > MAX_JOINT_STATE:
-            raise BagError(f"'{self._path}' has a joint state of {messages.shape[1]} bytes")
-        message = messages[0].tobytes()
-        try:
-            numbers = None if self._layout is None else self._layout.unpack(messages)
-            if numbers is None:
-                frame, _ = self._decode_one(messages[0])
-                self._layout = joint_state_layout(self.names, frame, self._sizes)
-                numbers = self._layout.unpack(messages)
-            if numbers is None:
-                parts = zip(*(self._decode_one(each)[1] for each in messages), strict=True)
-                numbers = [np.array(part, np.float64) for part in parts]
-            return numbers
-        except BagError:
-            raise
-        except MixtureError as error:
-            raise BagError(f"'{self._path}' has joint states of different {error}") from error
-        except Exception as error:  # rosbags raises any exception for bytes that are not a JointState
-            packed = message.startswith(ZSTD_MAGIC)
-            reason = "its messages are compressed" if packed else "a joint state is damaged"
-            raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
-
-    def _decode_one(self, message: Rows) -> tuple[str, list[Array]]:
-        """Return the frame and the numbers of a message, whose joints must be the first one's."""
-        self._odd += message.nbytes
-        if self._odd > MAX_ODD:
-            raise BagError(f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form")
-        frame, names, *parts = _deserialised(message.tobytes())
-        sizes = tuple(map(len, parts))
-        if not self._sizes:
-            self.names, self._sizes = names, sizes
-        if names != self.names:
-            raise MixtureError("joints")
-        if sizes != self._sizes:
-            raise MixtureError("sizes")
-        return frame, parts
-
-
-def _deserialised(message: bytes) -> tuple[Any, ...]:
-    """Return frame, names, positions, velocities and efforts of a JointState."""
-    state: Any = store_of(JOINT_STATE).deserialize_cdr(message, JOINT_STATE)
-    return state.header.frame_id, tuple(state.name), state.position, state.velocity, state.effort
-
-
-class _Ends(_JointStates):
-    """First and last joint state of one topic."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._ends: list[tuple[int, Rows]] = []
-
-    def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add N joint states."""
-        first, last = int(np.argmin(stamps)), len(stamps) - 1 - int(np.argmax(stamps[::-1]))
-        some = [*self._ends, *((int(stamps[k]), messages[k : k + 1]) for k in (first, last))]
-        earliest = min(some, key=lambda end: end[0])
-        self._ends = [earliest, max(reversed(some), key=lambda end: end[0])]
-
-    def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Return stamps, positions, velocities and efforts of both states."""
-        for stamp, message in self._ends:
-            super().add(np.array([stamp]), message)
-        return super().arrays()
-
-
-class _Targets:
-    """Points on /target, all in one frame."""
-
-    def __init__(self) -> None:
-        self._frame: bytes | None = None
-        self._sound = True
-        self._stamps, self._points = array("q"), array("d")
-
-    def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add PointStampeds, or PoseStampeds, which begin alike."""
-        try:
-            frame, points = unpack_points(messages)
-        except (MixtureError, IndexError, struct.error):
-            self._sound = False
-            return
-        self._sound &= self._frame in (None, frame)
-        self._frame = frame
-        new = np.ones(len(stamps), bool)  # repeated points are dropped
-        new[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
-        self._stamps.frombytes(stamps[new].tobytes())
-        self._points.frombytes(points[new].tobytes())
-
-    def received(self, stamps: Stamps) -> ReceivedTargets | None:
-        """Return the latest target at each stamp; None without targets, or if they are in several frames."""
-        if self._frame is None or not self._sound:
-            return None
-        own = np.asarray(self._stamps)
-        order = np.argsort(own, kind="stable")
-        points = np.asarray(self._points).reshape(-1, 3)[order]
-        latest = np.searchsorted(own[order], stamps, side="right") - 1
-        received = np.where((latest >= 0)[:, None], points[latest], np.nan)
-        return ReceivedTargets(self._frame.decode("utf-8", "replace"), received)
