@@ -311,7 +311,7 @@ def test_further_faults_are_named(default, tmp_path, monkeypatch):
     with pytest.raises(PlotError, match=r"^there is no URDF 'gone\.urdf'"):
         plot(default.bag, urdf="gone.urdf")
     none = third_party_bag(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
-    with pytest.raises(PlotError, match=r"'.*bag' has 0 positions for 1 joints"):
+    with pytest.raises(TwoDofError, match=r"'.*bag' has 0 positions for 1 joints"):
         plot(none)
     with pytest.raises(TwoDofError, match="gone"):
         plot("gone")

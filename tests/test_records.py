@@ -196,6 +196,29 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
     assert "has metadata 'twodof' of 335" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("names", "sizes", "said"),
+    [
+        ("ab", (2, 0, 0), ""),
+        ("ab", (2, 2, 2), ""),
+        ("", (2, 2, 0), ""),
+        ("ab", (1, 1, 0), "has 1 positions for 2 joints"),
+        ("ab", (0, 2, 2), "has 0 positions for 2 joints"),
+        ("", (0, 0, 0), "has 0 positions for 0 joints"),
+        ("ab", (2, 1, 2), "has 1 and 2 velocities and efforts for 2 joints"),
+        ("aa", (2, 0, 0), "has two joints 'a'"),
+    ],
+)
+def test_joint_states_have_as_many_numbers_as_joints(bag, names, sizes, said, tmp_path, capsys):
+    data = serialised(joint_message(START * SECOND, names, *map(np.zeros, sizes)))
+    (bag / "bag.mcap").write_bytes(TOPIC + message(data) * 40 + FOOTER)
+    for command in (["info", str(bag)], ["export", str(bag), "-o", str(tmp_path / "x.csv")]):
+        assert main(command) == bool(said)
+        assert said in capsys.readouterr().err
+    if not said:
+        assert read_bag(bag).joints == (tuple(names) or ("joint 1", "joint 2"))
+
+
 def test_joint_states_that_are_decoded_one_by_one_are_limited(bag, monkeypatch):
     """Frames of one length differ; each message takes 20 µs, and with many names milliseconds."""
     monkeypatch.setattr(joint_states, "MAX_ODD", 2000)

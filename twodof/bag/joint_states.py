@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from array import array
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ class JointStates:
         self.names: tuple[str, ...] = ()
         self._path = path
         self._layout: Layout | None = None
+        self._names: tuple[str, ...] = ()
         self._sizes: tuple[int, ...] = ()
         self._odd = 0  # bytes that were decoded one by one
         self._stamps = array("q")
@@ -70,7 +72,7 @@ class JointStates:
             numbers = None if self._layout is None else self._layout.unpack(messages)
             if numbers is None:
                 frame, _ = self._decode_one(messages[0])
-                self._layout = joint_state_layout(self.names, frame, self._sizes)
+                self._layout = joint_state_layout(self._names, frame, self._sizes)
                 numbers = self._layout.unpack(messages)
             if numbers is None:
                 parts = zip(*(self._decode_one(each)[1] for each in messages), strict=True)
@@ -85,6 +87,19 @@ class JointStates:
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
 
+    def _checked(self, names: tuple[str, ...], positions: int, *others: int) -> tuple[str, ...]:
+        """Return the joints, numbered if the messages do not name them; any array of a JointState may be empty."""
+        names = names or tuple(f"joint {i + 1}" for i in range(positions))
+        if not names or positions != len(names):
+            raise BagError(f"'{self._path}' has {positions} positions for {len(names)} joints")
+        if {*others} - {0, positions}:
+            sizes = " and ".join(map(str, others))
+            raise BagError(f"'{self._path}' has {sizes} velocities and efforts for {positions} joints")
+        if len({*names}) < positions:
+            twice = next(name for name, count in Counter(names).items() if count > 1)
+            raise BagError(f"'{self._path}' has two joints '{twice}'")
+        return names
+
     def _decode_one(self, message: Rows) -> tuple[str, list[Array]]:
         """Return the frame and the numbers of a message, whose joints must be the first one's."""
         self._odd += message.nbytes
@@ -93,8 +108,9 @@ class JointStates:
         frame, names, *parts = _deserialised(message.tobytes())
         sizes = tuple(map(len, parts))
         if not self._sizes:
-            self.names, self._sizes = names, sizes
-        if names != self.names:
+            self._names, self._sizes = names, sizes
+            self.names = self._checked(names, *sizes)
+        if names != self._names:
             raise MixtureError("joints")
         if sizes != self._sizes:
             raise MixtureError("sizes")

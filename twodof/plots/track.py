@@ -183,9 +183,7 @@ def _lines(track: Track) -> list[Array]:
 
 
 def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> Track:
-    names = bag.joints or tuple(f"joint {i + 1}" for i in range(bag.q.shape[1]))
-    if not bag.q.size or bag.q.shape[1] != len(names):
-        raise PlotError(f"'{bag.path}' has {bag.q.shape[1]} positions for {len(names)} joints")
+    names = bag.joints
     if urdf is None:
         urdf, source = bag.provenance.get("urdf"), f"the URDF in '{bag.path}'"
     try:
