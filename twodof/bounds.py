@@ -96,4 +96,5 @@ MAX_SWEEP = 512 * MIB  # the table in memory: a million runs, each with a messag
 # figures and pages
 MAX_PANELS = 256  # of a figure; Matplotlib takes 0.1 s for one
 MAX_FRAMES = 200_000  # of a film, some hours of work
+MAX_STYLES = 1 * MIB  # a matplotlibrc in the working directory; matplotlib's own has 43 KB
 MAX_HEAD = 64 * KIB  # beginning of a file that identifies a page
