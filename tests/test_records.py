@@ -241,6 +241,24 @@ def test_robots_of_a_bag_that_are_read_together_are_limited(bag, command, capsys
     assert capsys.readouterr().err == f"twodof: error: the bag '{bag}' is of 33 robots, more than 32 at a time; {one}\n"
 
 
+@pytest.mark.parametrize(("command", "passes"), [(["info"], 2), (["info", "--json"], 2), (["plot", "-o", "x.png"], 1)])
+def test_a_bag_of_several_robots_is_read_once(bag, command, passes, monkeypatch, tmp_path, capsys):
+    """``info`` reads the samples again, for the verdicts."""
+    robots = [f"r{i}" for i in range(1, 6)]
+    topics = b"".join(channel(i, f"/{robot}/joint_states") for i, robot in enumerate(robots))
+    data = [message(joint_state(2, START + t), number=i) for t in range(9) for i in range(len(robots))]
+    (bag / "bag.mcap").write_bytes(HEADER + SCHEMA + topics + b"".join(data) + FOOTER)
+    for robot in robots:
+        (bag / f"run.{robot}.json").write_text("{}")
+    readings = count(1)
+    read = reader.read_messages
+    monkeypatch.setattr(reader, "read_messages", lambda *given: [next(readings)] and read(*given))
+    monkeypatch.chdir(tmp_path)
+    assert main([command[0], str(bag), *command[1:]]) == 0
+    said = capsys.readouterr().out
+    assert next(readings) == passes + 1 and all(robot in said for robot in robots)
+
+
 def test_a_single_file_without_chunks_is_read_at_any_length(tmp_path, monkeypatch):
     """As ``ros2 bag record --storage-preset-profile fastwrite`` writes it."""
     monkeypatch.setattr(ReadBudget.__init__, "__defaults__", (10_000,))

@@ -6,20 +6,21 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cached_property
 from pathlib import Path
 
 from ..bounds import MAX_DRAWN, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
 from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
+from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET
 from .contents import read_messages, stated_count, storage_files
 from .downsampling import Downsampler
 from .joint_states import Ends, JointStates, Targets
 from .provenance import file_of, read_provenance, robot_in, robots_of
 from .recording import Array, Inputs, Recording, TopicCount
-from .records import DamageError, ReadBudget
-from .summary import read_summary
+from .records import Channel, DamageError, ReadBudget, Stamps
+from .summary import McapSummary, read_summary
 
 LOG = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: the path is not a bag, or the bag is unfinished, damaged or without joint states.
     """
-    return _read(path_of(path, "bag"), JointStates, Targets())
+    return _read([_Robot(path_of(path, "bag"), JointStates, Targets())])[0]
 
 
 def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
@@ -42,42 +43,58 @@ def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], S
     Memory holds at most ``most`` samples and a chunk of the bag. ``lines`` returns the curves of a part of the bag that
     are drawn in addition to positions and velocities; its exceptions are passed on.
     """
-    return _read(Path(path), JointStates, Targets(), Downsampler(most, lines))
+    return _read([_Robot(Path(path), JointStates, Targets(), Downsampler(most, lines))])[0]
+
+
+def read_bags(paths: Sequence[str | Path]) -> list[Recording]:
+    """Read robots of one bag as ``read_bag`` does, in one pass."""
+    return _read([_Robot(Path(path), JointStates, Targets()) for path in paths])
 
 
 def read_ends(path: str | Path) -> Recording:
-    """Return the first and the last joint state of a bag.
+    """Return the first and the last joint state of a bag, as ``read_all_ends`` does."""
+    return read_all_ends([Path(path)])[0]
 
-    Use the summaries of the files if all have a valid one; otherwise read the whole bag.
+
+def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
+    """Return the first and the last joint state of robots of one bag.
+
+    Use the summaries of the files if all have a valid one; otherwise read the whole bag once.
 
     Raises:
         BagError: as ``read_bag``.
     """
-    path = Path(path)
-    folder, prefix, others = _place(path)
+    folder, _ = robot_in(paths[0])
     with _refusing(folder):
         summaries = [read_summary(file) for file in whole_bag(folder)]
-        if None in summaries:
-            return _read(path, Ends, None)
-        counts: Counter[tuple[str, str]] = Counter()
-        total = 0
-        for summary in filter(None, summaries):
-            for number, count in summary.counts.items():
-                channel = summary.channels[number]
-                if _is_within(channel.topic, prefix, others):
-                    counts[channel.topic, channel.type] += count
-                total += count
-        stating = [topic for topic, kind in counts if kind == JOINT_STATE]
-        usual = prefix + JOINT_STATES
-        if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
-            return _read(path, Ends, None)
-        chosen = usual if usual in stating else "".join(stating)
-        ends, budget = Ends(path), ReadBudget()
-        for summary in filter(None, summaries):
-            for batch in summary.ends(chosen, budget):
-                ends.add(batch.stamps, batch.messages)
-        _check_count(folder, total)
-        return _recording(path, counts, chosen, ends, None, lambda: Inputs(read_provenance(*robot_in(path))))
+        valid = [summary for summary in summaries if summary is not None]
+        found = [_ends(path, valid) if len(valid) == len(summaries) else None for path in paths]
+    rest = iter(_read([_Robot(path, Ends, None) for path, known in zip(paths, found) if known is None]))
+    return [known or next(rest) for known in found]
+
+
+def _ends(path: Path, summaries: Sequence[McapSummary]) -> Recording | None:
+    """Return the ends of a robot's joint states by the summaries; None if these do not decide on the topic."""
+    folder, prefix, others = _place(path)
+    counts: Counter[tuple[str, str]] = Counter()
+    total = 0
+    for summary in summaries:
+        for number, count in summary.counts.items():
+            channel = summary.channels[number]
+            if _is_within(channel.topic, prefix, others):
+                counts[channel.topic, channel.type] += count
+            total += count
+    stating = [topic for topic, kind in counts if kind == JOINT_STATE]
+    usual = prefix + JOINT_STATES
+    if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
+        return None
+    chosen = usual if usual in stating else "".join(stating)
+    ends, budget = Ends(path), ReadBudget()
+    for summary in summaries:
+        for batch in summary.ends(chosen, budget):
+            ends.add(batch.stamps, batch.messages)
+    _check_count(folder, total)
+    return _recording(path, counts, chosen, ends, None, Inputs(read_provenance(*robot_in(path))))
 
 
 def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
@@ -106,55 +123,77 @@ def _refusing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _read(
-    path: Path, kind: type[JointStates], targets: Targets | None, downsampler: Downsampler | None = None
-) -> Recording:
-    """Read a bag's joint states with the given accumulator, and downsample them."""
-    counts: Counter[tuple[str, str]] = Counter()
-    chosen, states, total = "", kind(path), 0
-    budget, thinned, most = ReadBudget(), False, MAX_SAMPLES
+class _Robot:
+    """Joint states and targets of a robot, while its bag is read; with a downsampler, a choice of them."""
 
-    inputs = cache(lambda: Inputs(read_provenance(*robot_in(path))))
+    def __init__(
+        self, path: Path, kind: type[JointStates], targets: Targets | None, downsampler: Downsampler | None = None
+    ) -> None:
+        self.path, self.downsampler = path, downsampler
+        self.folder, self._prefix, self._others = _place(path)
+        self._kind, self._targets = kind, targets
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._chosen, self.states, self._thinned = "", kind(path), False
 
-    def thin(downsampler: Downsampler) -> None:
-        states.keep(downsampler.choose(_recording(path, counts, chosen, states, targets, inputs)))
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return Inputs(read_provenance(*robot_in(self.path)))
 
-    folder, prefix, others = _place(path)
+    def add(self, channel: Channel, stamps: Stamps, messages: Rows) -> None:
+        """Add messages of any topic of the bag."""
+        if not _is_within(channel.topic, self._prefix, self._others):
+            return
+        self._counts[channel.topic, channel.type] += len(stamps)
+        if channel.type == JOINT_STATE:
+            usual = channel.topic == self._prefix + JOINT_STATES
+            if channel.topic != self._chosen and (not self._chosen or usual):
+                self._chosen, self.states = channel.topic, self._kind(self.path)
+            if channel.topic == self._chosen:
+                self.states.add(stamps, messages)
+                if self.downsampler is not None:
+                    self.downsampler.most = min(self.downsampler.most, MAX_DRAWN * len(self.states) // self.states.size)
+                    if len(self.states) > self.downsampler.most:
+                        self._thin(self.downsampler)
+        elif self._targets and channel.topic == self._prefix + TARGET and channel.type in (POINT, POSE):
+            self._targets.add(stamps, messages)
+
+    def _thin(self, downsampler: Downsampler) -> None:
+        self._thinned = True
+        self.states.keep(downsampler.choose(self._made()))
+
+    def _made(self) -> Recording:
+        return _recording(self.path, self._counts, self._chosen, self.states, self._targets, self._inputs)
+
+    def recording(self) -> Recording:
+        """Return the recording at the end of the bag."""
+        stating = [topic for topic, kind in self._counts if kind == JOINT_STATE]
+        if len(stating) > 1 and self._chosen != self._prefix + JOINT_STATES:
+            topics = ", ".join(map(shown, stating))
+            LOG.warning(f"'{self.path}' has several topics of joint states, {topics}; {shown(self._chosen)} is read")
+        if self.downsampler is not None and self._thinned:
+            self._thin(self.downsampler)  # downsample the end like the rest
+        return self._made()
+
+
+def _read(robots: Sequence[_Robot]) -> list[Recording]:
+    """Read a bag once, for some of its robots."""
+    if not robots:
+        return []
+    budget, total, most, folder = ReadBudget(), 0, MAX_SAMPLES, robots[0].folder
     with _refusing(folder):
         files = whole_bag(folder)
-        if downsampler is None:  # a bag of a few MB may unpack to gigabytes
+        if robots[0].downsampler is None:  # a bag of a few MB may unpack to gigabytes
             most = min(most, MAX_DRAWN + MAX_SAMPLES_RATIO * sum(file.stat().st_size for file in files))
         for file in files:
             for channel, stamps, messages in read_messages(file, budget):
                 total += len(stamps)
-                if not _is_within(channel.topic, prefix, others):
-                    continue
-                counts[channel.topic, channel.type] += len(stamps)
-                if channel.type == JOINT_STATE:
-                    usual = channel.topic == prefix + JOINT_STATES
-                    if channel.topic != chosen and (not chosen or usual):
-                        chosen, states = channel.topic, kind(path)
-                    if channel.topic == chosen:
-                        states.add(stamps, messages)
-                        if states.size > most:
-                            much = f"{most // MIB} MiB of joint states"
-                            raise BagError(f"'{path}' unpacks to more than {much}; cut it into several bags")
-                        if downsampler is not None:
-                            downsampler.most = min(downsampler.most, MAX_DRAWN * len(states) // states.size)
-                            if len(states) > downsampler.most:
-                                thin(downsampler)
-                                thinned = True
-                elif targets and channel.topic == prefix + TARGET and channel.type in (POINT, POSE):
-                    targets.add(stamps, messages)
+                for robot in robots:
+                    robot.add(channel, stamps, messages)
+                if channel.type == JOINT_STATE and sum(robot.states.size for robot in robots) > most:
+                    much = f"{most // MIB} MiB of joint states"
+                    raise BagError(f"'{robots[0].path}' unpacks to more than {much}; cut it into several bags")
         _check_count(folder, total)
-    stating = [topic for topic, kind in counts if kind == JOINT_STATE]
-    if len(stating) > 1 and chosen != prefix + JOINT_STATES:
-        LOG.warning(
-            f"'{path}' has several topics of joint states, {', '.join(map(shown, stating))}; {shown(chosen)} is read"
-        )
-    if downsampler is not None and thinned:
-        thin(downsampler)  # downsample the end like the rest
-    return _recording(path, counts, chosen, states, targets, inputs)
+    return [robot.recording() for robot in robots]
 
 
 def _check_count(path: Path, count: int) -> None:
@@ -173,7 +212,7 @@ def _recording(
     chosen: str,
     states: JointStates,
     targets: Targets | None,
-    inputs: Callable[[], Inputs],
+    inputs: Inputs,
 ) -> Recording:
     if not counts[chosen, JOINT_STATE]:
         _, robot = robot_in(path)
@@ -190,8 +229,8 @@ def _recording(
         v=v,
         tau=tau,
         received=targets.received(stamps) if targets is not None else None,
-        provenance=inputs().provenance,
-        inputs=inputs(),
+        provenance=inputs.provenance,
+        inputs=inputs,
     )
 
 
