@@ -56,7 +56,7 @@ MAX_FATAL_MESHES = 3  # meshes that end their reader, before the remaining ones 
 
 # inputs over time
 MAX_TABLE = 64 * MIB  # a CSV file
-MAX_CELLS = 1_000_000  # all cells are stored in the bag's run.json
+MAX_CELLS = 1_000_000  # all cells are stored in the bag's run.json; also of all references of an FMU
 MAX_COMMANDS = 1_000_000  # messages of a bag
 MAX_COMMAND = 64 * KIB  # a message; some thousand joints, read within milliseconds
 MAX_COMMANDS_SIZE = 384 * MIB  # all of these messages, and what they take in memory
