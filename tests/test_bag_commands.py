@@ -2,6 +2,7 @@
 
 import html
 import json
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -187,3 +188,17 @@ def test_a_plot_of_two_bags_prints_their_largest_difference(tmp_path, capfd):
     text = "at most 0.25 from 'real', b at 1 s; RMS 0.145"
     assert f"; {text}\n" in capfd.readouterr().out
     assert text in html.unescape((tmp_path / "both.html").read_text())
+
+
+def test_names_of_unknown_joints_take_little_memory(effort, tmp_path, caplog):
+    """A message may name thousands of them."""
+    names = ["joint1", *(f"stranger{i}" for i in range(2000))]
+    message = joint_message(0, names, (), (), np.ones(len(names)))
+    bag = write_third_party(tmp_path / "bag", [("/cmd", BEGIN + k * STEP, message) for k in range(100)])
+    twodof.read_commands(effort, bag, "/cmd")  # imports
+    tracemalloc.start()
+    changes = twodof.read_commands(effort, bag, "/cmd")
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(changes) == 100 and held < 2 * 1024**2
+    assert "joints that this robot does not have are ignored: 'stranger0, stranger1" in caplog.text

@@ -14,6 +14,7 @@ from test_fit import ARM, FREE, GRAVITY, HIDDEN, JOINTS, TRUTH
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import InputError
 from twodof.identification import excitation
 
 
@@ -126,3 +127,19 @@ def test_a_design_that_is_not_possible_is_refused_in_a_line(words, message, tmp_
     assert main(["fit", str(ARM), *words, "--free", "payload"]) in (1, 2)
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and not [*tmp_path.iterdir()]
+
+
+def test_the_work_of_a_search_is_limited(monkeypatch, caplog):
+    """Two seconds of processor time for each step would be hours for a humanoid."""
+    steps: list[tuple[int, int]] = []
+    monkeypatch.setattr(excitation, "MOST_WORK", 30 * 5 * 50 * 2 * 2 * 22)
+
+    def design() -> None:
+        twodof.excite(ARM, 5.0, "friction[*]", gravity=GRAVITY, progress=lambda *of: steps.append(of))
+
+    design()
+    assert steps == [(1, 3), (2, 3), (3, 3)]
+    assert "the search for the motion ends after 3 of 60 steps, because 2 parameters of 2 joints" in caplog.text
+    monkeypatch.setattr(excitation, "MOST_WORK", 30 * 3 * 50 * 2 * 2 * 22 - 1)
+    with pytest.raises(InputError, match="2 parameters of 2 joints takes too long to design; `free` fewer"):
+        design()

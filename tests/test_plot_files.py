@@ -311,7 +311,7 @@ def test_further_faults_are_named(default, tmp_path, monkeypatch):
     with pytest.raises(PlotError, match=r"^there is no URDF 'gone\.urdf'"):
         plot(default.bag, urdf="gone.urdf")
     none = third_party_bag(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
-    with pytest.raises(PlotError, match=r"'.*bag' has 0 positions for 1 joints"):
+    with pytest.raises(TwoDofError, match=r"'.*bag' has 0 positions for 1 joints"):
         plot(none)
     with pytest.raises(TwoDofError, match="gone"):
         plot("gone")
@@ -353,3 +353,20 @@ def test_the_command_prints_the_path_of_the_plot_and_the_verdict(gains, foreign,
     printed = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in printed] == ["plot", "Kp = 20 s⁻²", "Kp = 50 s⁻²"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["Kp50.png", "a.svg", "both.html", "ur5.urdf"]
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda file: file.symlink_to("/dev/zero"), "Not a regular file"),
+        (os.mkfifo, "Not a regular file"),
+        (lambda file: file.write_bytes(b"\xff\xfe"), "it is not UTF-8 text"),
+        (lambda file: os.truncate(os.open(file, os.O_CREAT | os.O_RDWR), 2**32), "File too large"),
+    ],
+)
+def test_a_matplotlibrc_in_the_working_directory_that_cannot_be_read_is_refused(default, tmp_path, make, said):
+    """Matplotlib would read it while it is imported."""
+    make(tmp_path / "matplotlibrc")
+    done = python("-m", "twodof", "plot", str(default.bag.absolute()), "-o", "a.png", cwd=tmp_path, env=ENVIRONMENT)
+    assert done.returncode == 1
+    assert done.stderr.startswith("twodof: error: cannot plot in this folder, move its file 'matplotlibrc': " + said)

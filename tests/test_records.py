@@ -3,11 +3,13 @@
 MCAP files are made record by record by the specification. test_hostile_bags.py tests time and memory.
 """
 
+import json
 import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
-from itertools import count
+from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 
 import lz4.frame
@@ -34,7 +36,7 @@ from bags import (
 )
 
 import twodof
-from twodof.bag import reader
+from twodof.bag import joint_states, reader
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.records import DamageError, ReadBudget
@@ -194,12 +196,37 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
     assert "has metadata 'twodof' of 335" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("names", "sizes", "said"),
+    [
+        ("ab", (2, 0, 0), ""),
+        ("ab", (2, 2, 2), ""),
+        ("", (2, 2, 0), ""),
+        ("ab", (1, 1, 0), "has 1 positions for 2 joints"),
+        ("ab", (0, 2, 2), "has 0 positions for 2 joints"),
+        ("", (0, 0, 0), "has 0 positions for 0 joints"),
+        ("ab", (2, 1, 2), "has 1 and 2 velocities and efforts for 2 joints"),
+        ("aa", (2, 0, 0), "has two joints 'a'"),
+    ],
+)
+def test_joint_states_have_as_many_numbers_as_joints(bag, names, sizes, said, tmp_path, capsys):
+    data = serialised(joint_message(START * SECOND, names, *map(np.zeros, sizes)))
+    (bag / "bag.mcap").write_bytes(TOPIC + message(data) * 40 + FOOTER)
+    for command in (["info", str(bag)], ["export", str(bag), "-o", str(tmp_path / "x.csv")]):
+        assert main(command) == bool(said)
+        assert said in capsys.readouterr().err
+    if not said:
+        assert read_bag(bag).joints == (tuple(names) or ("joint 1", "joint 2"))
+
+
 def test_joint_states_that_are_decoded_one_by_one_are_limited(bag, monkeypatch):
-    """They differ in frame; each takes 20 µs, and with many names milliseconds."""
-    frames = [serialised(joint_message(t, ["a", "b"], [0.0, 1.0], frame="x" * (t % 2))) for t in range(40)]
-    (bag / "bag.mcap").write_bytes(TOPIC + b"".join(message(data, t) for t, data in enumerate(frames)) + FOOTER)
-    assert len(twodof.read_bag(bag).t) == 40
-    monkeypatch.setattr(reader, "MAX_ODD", 1000)
+    """Frames of one length differ; each message takes 20 µs, and with many names milliseconds."""
+    monkeypatch.setattr(joint_states, "MAX_ODD", 2000)
+    for frames in ("", "longer"), ("", "x"):
+        data = [serialised(joint_message(t, ["a", "b"], [0.0, 1.0], frame=frames[t % 2])) for t in range(40)]
+        (bag / "bag.mcap").write_bytes(TOPIC + b"".join(map(message, data, range(40))) + FOOTER)
+        if "longer" in frames:
+            assert len(twodof.read_bag(bag).t) == 40
     with pytest.raises(BagError, match="MiB of joint states of changing form"):
         twodof.read_bag(bag)
 
@@ -212,6 +239,24 @@ def test_robots_of_a_bag_that_are_read_together_are_limited(bag, command, capsys
     assert main([command, str(bag)]) == 1
     one = f"give one, such as '{bag}:r00'"
     assert capsys.readouterr().err == f"twodof: error: the bag '{bag}' is of 33 robots, more than 32 at a time; {one}\n"
+
+
+@pytest.mark.parametrize(("command", "passes"), [(["info"], 2), (["info", "--json"], 2), (["plot", "-o", "x.png"], 1)])
+def test_a_bag_of_several_robots_is_read_once(bag, command, passes, monkeypatch, tmp_path, capsys):
+    """``info`` reads the samples again, for the verdicts."""
+    robots = [f"r{i}" for i in range(1, 6)]
+    topics = b"".join(channel(i, f"/{robot}/joint_states") for i, robot in enumerate(robots))
+    data = [message(joint_state(2, START + t), number=i) for t in range(9) for i in range(len(robots))]
+    (bag / "bag.mcap").write_bytes(HEADER + SCHEMA + topics + b"".join(data) + FOOTER)
+    for robot in robots:
+        (bag / f"run.{robot}.json").write_text("{}")
+    readings = count(1)
+    read = reader.read_messages
+    monkeypatch.setattr(reader, "read_messages", lambda *given: [next(readings)] and read(*given))
+    monkeypatch.chdir(tmp_path)
+    assert main([command[0], str(bag), *command[1:]]) == 0
+    said = capsys.readouterr().out
+    assert next(readings) == passes + 1 and all(robot in said for robot in robots)
 
 
 def test_a_single_file_without_chunks_is_read_at_any_length(tmp_path, monkeypatch):
@@ -266,6 +311,20 @@ def test_mcap_of_a_robot_at_rest_is_read_at_any_length(tmp_path, what, compressi
     assert np.concatenate([stamps for _, stamps, _ in found]).tolist() == stamps
 
 
+def test_messages_of_varying_lengths_are_read_in_few_batches(tmp_path):
+    """Lengths alternate, repeat in a longer period, and come at random; a batch takes 20 µs."""
+    file, rng = tmp_path / "x.mcap", np.random.default_rng(1)
+    patterns = [0, 1] * 500, [0, 0, 1] * 300, [0, 1, 1, 0, 2] * 200, [*rng.integers(0, 4, 1000)], [2] * 40 + [1] * 40
+    lengths = [int(size) for size in chain(*patterns)]
+    written = [message(bytes([k % 251]) * size, k, number=1 + k % 7 // 6) for k, size in enumerate(lengths)]
+    file.write_bytes(TOPIC + channel(2, "/x") + chunk(b"".join(written), sum(map(len, written)), "") + FOOTER)
+    batches = [*read_messages(file, ReadBudget())]
+    found = [(t, rows[i]) for _, stamps, rows in batches for i, t in enumerate(stamps.tolist())]
+    assert [k for k, _ in sorted(found, key=lambda each: each[0])] == [*range(len(lengths))]
+    assert all(row.tobytes() == bytes([k % 251]) * lengths[k] for k, row in found)
+    assert len(batches) < 40
+
+
 @pytest.mark.parametrize("read", [read_bag, read_ends])
 def test_memory_is_that_of_the_numbers(bag, read):
     n = 60_000
@@ -285,6 +344,23 @@ def test_large_records_outside_chunks_are_read_one_after_another(bag):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 80 * 1024**2
+
+
+def test_a_provenance_is_evaluated_once_however_often_samples_are_chosen(bag, monkeypatch):
+    """One of some megabytes takes a second."""
+    (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) * 60_000 + FOOTER)
+    given = {"start_time": 0.0, "step": 0.01, "start_values": {"a": 0.0}, "input_changes": [[0.0, {"a": 1.0}]]}
+    readings, schedules = count(), []
+    monkeypatch.setattr(reader, "read_provenance", lambda *where: next(readings) or given)
+
+    def lines(part):
+        schedules.append(part.schedule[0][1])
+        assert replace(part, q=part.q).schedule[0][1] is schedules[0]
+        return [part.held("a", 1)]
+
+    drawn = reader.read_downsampled(bag, 1000, lines)
+    assert len(schedules) > 5 and {*map(id, [*schedules, drawn.schedule[0][1]])} == {id(schedules[0])}
+    assert next(readings) == 1
 
 
 def test_joint_states_in_memory_are_bounded(bag, monkeypatch):
@@ -330,3 +406,20 @@ def test_hostile_provenance_is_refused(native_path, tmp_path, content, capsys):
         sink.write(sample(run, 0))
     (bag / "run.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     assert "run.json" in refused(capsys, bag)
+
+
+@pytest.mark.parametrize("output", ["x.html", "x.png"])
+def test_a_provenance_may_have_half_characters_and_more_facts(native_path, tmp_path, output, capsys):
+    bag = tmp_path / "bag"
+    twodof.run(native_path, twodof.Bag(bag), stop_time=0.1)
+    facts = json.loads((bag / "run.json").read_text())
+    facts["fmu"]["file"] = facts["command_line"] = "\ud800 and \U0001f600"
+    facts["verdict"]["later"] = facts["verdict"]["lines"] = ["half a \udc00"]
+    facts["verdict"]["causes"] = [
+        {"kind": "", "text": "", "joint": "", "share": 0, "point": [], "noted": True, "subject": "", "later": 1}
+    ]
+    (bag / "run.json").write_text(json.dumps(facts))
+    assert main(["plot", str(bag), "-o", str(tmp_path / output)]) == 0
+    assert main(["info", str(bag)]) == 0
+    said = capsys.readouterr().out
+    assert "? and \U0001f600" in said and "half a ?" in said

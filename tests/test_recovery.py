@@ -375,6 +375,19 @@ def test_damaged_bag_is_made_anew(run, tmp_path, damage):
     assert assert_consistent(bag.path, "mcap") == 20
 
 
+def test_a_bag_that_unpacks_to_much_more_than_its_size_is_left_as_it_is(run, tmp_path, monkeypatch):
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        for k in range(20):
+            bag.write(sample(run, k))
+    (bag.path / "metadata.yaml").unlink()
+    before = content(tmp_path)
+    monkeypatch.setattr(recovery, "MAX_COPY", 1024)
+    monkeypatch.setattr(recovery, "MAX_COPY_RATIO", 0)
+    with pytest.raises(BagError, match="bag' unpacks to more than 0 MiB of messages; cut its files"):
+        twodof.recover(bag.path)
+    assert content(tmp_path) == before
+
+
 def test_damaged_provenance_does_not_keep_the_messages(run, tmp_path):
     bag = unfinished(tmp_path, run, "mcap", 10)
     (bag / "run.json").write_text('{"format": 1, "fmu": {"na')

@@ -17,10 +17,11 @@ from tools import needs
 
 import twodof
 from twodof.cli.main import main
-from twodof.errors import InputError
+from twodof.errors import FmuError, InputError
 from twodof.export.compiler import UNITS
 from twodof.fmu import checking
 from twodof.fmu.description import load_any_fmu
+from twodof.fmu.reference_runs import references_of
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
 MANIFEST = f"{FOLDER}fmi-ls-manifest.xml"
@@ -183,7 +184,7 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
     [
         ("push-ref.csv", b"0.01,", b"0.01,x", "could not convert"),
         ("push-ref.csv", b"\n0.02,", b"\n0.02,1,", "cannot be read"),
-        ("push.ssv", b"ssv:Real", b"ssv:Complex", "cannot be read"),
+        ("push.ssv", b"ssv:Real", b"ssv:Complex", "is of type Complex, which is not set"),
         ("references.exp", b'"push.ssv"', b'"none.ssv"', "none.ssv"),
         ("references.exp", b'"push.ssv"', b'"../../../../etc/passwd"', "etc/passwd"),
         ("references.exp", b"<Experiments", b"<!DOCTYPE x><Experiments", "declares entities"),
@@ -201,6 +202,16 @@ def test_damaged_references_fail_their_row(
     files[FOLDER + name] = files[FOLDER + name].replace(old, new)
     found = rows(packed(files, tmp_path / "damaged.fmu"))
     assert any(row.outcome == "failed" and text in row.text for row in found.values()), found
+
+
+def test_the_cells_of_all_tables_are_limited(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = [content for name, content in members(built).items() if name.startswith(FOLDER) and name.endswith(".csv")]
+    cells = sum(1 + line.count(b",") for table in tables for line in table.splitlines()[1:])
+    monkeypatch.setattr("twodof.fmu.reference_runs.MAX_CELLS", cells)
+    assert len(references_of(load_any_fmu(built))) == 2
+    monkeypatch.setattr("twodof.fmu.reference_runs.MAX_CELLS", cells - 1)
+    with pytest.raises(FmuError, match=f"the tables have more than {cells - 1} cells"):
+        references_of(load_any_fmu(built))
 
 
 def test_an_experiment_may_have_any_name_and_needs_results(built: Path, tmp_path: Path) -> None:

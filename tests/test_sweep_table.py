@@ -23,6 +23,7 @@ from tables import COMMAND, SMALL, same, table_of
 
 import twodof
 from twodof import TwoDofError, sweep
+from twodof.cli.main import main
 from twodof.simulation.verdict import METRICS
 from twodof.sweeps.results import read_sweep
 
@@ -192,9 +193,13 @@ def described(table: pa.Table, key: str, value: object) -> pa.Table:
     return table.replace_schema_metadata({b"twodof": json.dumps(provenance)})
 
 
-def varying(table: pa.Table, count: int) -> pa.Table:
-    design = {"grids": {f"v{i}": [1.0] for i in range(count)}, "ranges": {}, "draws": 1, "seed": 0}
-    columns = [table.schema.field("Kp").with_name(f"v{i}") for i in range(count)]
+def not_utf8() -> pa.Array:
+    return pa.array([b"fin\xff"] * 2, pa.binary()).view(pa.string())
+
+
+def varying(table: pa.Table, count: int, name: str = "v") -> pa.Table:
+    design = {"grids": {f"{name}{i}": [1.0] for i in range(count)}, "ranges": {}, "draws": 1, "seed": 0}
+    columns = [table.schema.field("Kp").with_name(f"{name}{i}") for i in range(count)]
     fields = [table.schema.field(0), *columns, *[*table.schema][2:]]
     made = described(pa.schema(fields, table.schema.metadata).empty_table(), "design", design)
     return pa.Table.from_pylist([], made.schema)
@@ -218,6 +223,13 @@ HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
         table, "options", {"stop_time": 1, "step": 1, "settings": dict.fromkeys(map(str, range(10_001)), 1)}
     ),
     "a long provenance": lambda table: described(table, "command_line", "a" * 2**25),
+    "no word about bags": lambda table: described(table, "bags", None),
+    "a long name": lambda table: described(table, "fmu", {"file": "a" * 1001, "name": "", "guid": ""}),
+    "a long version": lambda table: described(table, "versions", {"twodof": "9" * 1001}),
+    "a long name of a variable": lambda table: varying(table, 1, "v" * 1001),
+    "an outcome of its own": lambda table: changed(table, "outcome", pa.array(["finished", "x" * 1000])),
+    "an outcome that is not UTF-8": lambda table: changed(table, "outcome", not_utf8()),
+    "a message that is not UTF-8": lambda table: changed(table, "message", not_utf8()),
     "endless": endless,
     "one text for all": of_one_text,
 }
@@ -238,14 +250,65 @@ def test_hostile_table_gets_one_line_in_little_memory(sound, tmp_path, make):
     store(pq.read_table(sound), tmp_path / "runs.parquet")
     assert len(read_sweep(tmp_path)) == 2
     store(make(pq.read_table(sound)), tmp_path / "runs.parquet")
+    refusal = r"runs\.parquet' (was not written|has more than 300|has a name)|it is damaged|Invalid UTF8"
     usual = pa.default_memory_pool()
     pa.set_memory_pool(READING)
     try:
-        with pytest.raises(TwoDofError, match=r"runs\.parquet' (was not written|has more than 300)|it is damaged"):
+        with pytest.raises(TwoDofError, match=refusal):
             read_sweep(tmp_path)
     finally:
         pa.set_memory_pool(usual)
     assert READING.max_memory() < 64 * 1024**2
+
+
+def links(folder: Path, victims: Path) -> dict[str, tuple[Path, Path]]:
+    """Links in a sweep's folder, by their kind, and the files outside of it that they name."""
+    return {
+        "the whole table": (folder / "runs.parquet", victims / "new.parquet"),
+        "the next part": (folder / "part-000001.parquet", victims / "file"),
+        "the bags": (folder / "bags", victims),
+        "a bag": (folder / "bags/000001", victims / "bag"),
+    }
+
+
+@pytest.mark.parametrize("kind", links(Path(), Path()))
+def test_links_in_a_sweep_are_not_followed(native_path, sound, tmp_path, kind):
+    folder, victims = tmp_path / "s", tmp_path / "victims"
+    (folder / "bags").mkdir(parents=True)
+    (victims / "bag").mkdir(parents=True)
+    (victims / "file").write_text("precious")
+    store(described(pq.read_table(sound).slice(0, 1), "bags", True), folder / "part-000000.parquet")
+    link, victim = links(folder, victims)[kind]
+    if link == folder / "bags":
+        link.rmdir()
+    link.symlink_to(victim)
+    with pytest.raises(TwoDofError, match="is a link, and links in a sweep are not followed"):
+        sweep(native_path, grid={"Kp": [1.0, 2.0]}, stop_time=0.02, output=folder, resume=True, bags=True, workers=1)
+    assert (victims / "file").read_text() == "precious" and {p.name for p in victims.iterdir()} == {"bag", "file"}
+    assert not [*(victims / "bag").iterdir()]
+
+
+def test_a_sweep_with_the_last_part_of_six_digits_is_resumed(native_path, sound, tmp_path):
+    store(pq.read_table(sound).slice(0, 1), tmp_path / "part-999999.parquet")
+    table = sweep(native_path, grid={"Kp": [1.0, 2.0]}, stop_time=0.02, output=tmp_path, resume=True, workers=1)
+    assert len(table) == 2 and [file.name for file in tmp_path.iterdir()] == ["runs.parquet"]
+
+
+def test_a_run_in_two_parts_is_refused_before_the_other_runs(native_path, sound, tmp_path):
+    for part in ("part-000000.parquet", "part-000001.parquet"):
+        store(pq.read_table(sound).slice(0, 1), tmp_path / part)
+    with pytest.raises(TwoDofError, match=r"part-000001\.parquet': it is damaged"):
+        sweep(native_path, grid={"Kp": [1.0, 2.0]}, stop_time=0.02, output=tmp_path, resume=True, workers=1)
+    assert len([*tmp_path.iterdir()]) == 2
+
+
+@pytest.mark.parametrize("picture", ["x.html", "x.png"])
+def test_half_characters_in_a_provenance_are_replaced(sound, tmp_path, picture, capsys):
+    half = {"file": "\ud800.fmu", "name": "\udfff", "guid": ""}
+    store(described(pq.read_table(sound), "fmu", half), tmp_path / "runs.parquet")
+    assert main(["plot", str(tmp_path), "-o", str(tmp_path / picture)]) == 0
+    assert main(["info", str(tmp_path)]) == 0
+    assert "?.fmu (?, )" in capsys.readouterr().out
 
 
 def zigzag(number: int) -> bytes:
@@ -280,8 +343,8 @@ def test_a_page_that_is_larger_than_stated_is_not_read(sound, tmp_path):
 import resource, sys
 import pyarrow as pa
 from twodof.errors import SweepError
-from twodof.sweeps import results
-results.MAX_SWEEP = 10_000_000
+from twodof.sweeps import results, stored_table
+stored_table.MAX_SWEEP = 10_000_000
 before = resource.getrlimit(resource.RLIMIT_AS)
 try:
     results.read_sweep(sys.argv[1])

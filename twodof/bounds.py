@@ -56,7 +56,7 @@ MAX_FATAL_MESHES = 3  # meshes that end their reader, before the remaining ones 
 
 # inputs over time
 MAX_TABLE = 64 * MIB  # a CSV file
-MAX_CELLS = 1_000_000  # all cells are stored in the bag's run.json
+MAX_CELLS = 1_000_000  # all cells are stored in the bag's run.json; also of all references of an FMU
 MAX_COMMANDS = 1_000_000  # messages of a bag
 MAX_COMMAND = 64 * KIB  # a message; some thousand joints, read within milliseconds
 MAX_COMMANDS_SIZE = 384 * MIB  # all of these messages, and what they take in memory
@@ -69,11 +69,14 @@ MAX_ROBOTS = 32  # that are read together, each of which reads the bag
 MAX_CHUNK = 256 * MIB  # a chunk or message; writers cut chunks at 1 to 4 MiB
 MAX_RATIO = 1000  # unpacked to packed size; an arm at rest reaches 24, a robot of 50 joints 220
 MAX_HOLLOW = 100  # size of a file to its size on the disk; file systems that compress reach 30
+MAX_COPY = 1024 * MIB  # messages that a recovery or an export writes, in addition to the next line
+MAX_COPY_RATIO = 250  # these messages to the size of the bag; a robot of 50 joints at rest reaches 220
 MAX_SUMMARY = 64 * MIB
 MAX_METADATA = 64 * MIB
 MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much memory
 MAX_PROVENANCES = 64 * MIB  # of all robots of a bag, which a recovery holds
 MAX_HELD = 5_000_000  # input values, summed over all changes of inputs
+CHANGE = 8  # input values for which a change counts besides its own, by its memory; a table of MAX_CELLS has room
 MAX_JOINT_STATE = 64 * KIB  # a message; a thousand joints
 MAX_ODD = 128 * MIB  # joint states that differ in frame, byte order or padding, which takes seconds
 MAX_SAMPLES = 2048 * MIB  # joint states in memory; a day of 7 joints at 100 Hz takes 1450 MiB
@@ -95,4 +98,5 @@ MAX_SWEEP = 512 * MIB  # the table in memory: a million runs, each with a messag
 # figures and pages
 MAX_PANELS = 256  # of a figure; Matplotlib takes 0.1 s for one
 MAX_FRAMES = 200_000  # of a film, some hours of work
+MAX_STYLES = 1 * MIB  # a matplotlibrc in the working directory; matplotlib's own has 43 KB
 MAX_HEAD = 64 * KIB  # beginning of a file that identifies a page

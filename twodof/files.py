@@ -318,13 +318,15 @@ def data_file(*parts: str) -> Path:
 
 
 def parsed(text: bytes) -> Any:
-    """Parse untrusted JSON.
+    """Parse untrusted JSON; "?" replaces surrogates, which UTF-8 does not have.
 
     Raises:
         ValueError, RecursionError: the text is not JSON, or would take much more memory than its length.
     """
     if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
         raise ValueError("it is damaged")  # empty lists and objects take 24 times the memory of their text
+    if re.search(rb"\\u[dD][89a-fA-F]", text):
+        text = json.dumps(json.loads(text.decode("utf-8")), ensure_ascii=False).encode("utf-8", "replace")
     return json.loads(text.decode("utf-8"))
 
 

@@ -55,7 +55,7 @@ def stated_count(folder: Path) -> int | None:
 
 
 def read_messages(file: Path, budget: ReadBudget) -> Iterator[Batch]:
-    """Read all messages of a file; the messages of a channel are in order.
+    """Read all messages of a file; those of a channel that have equal lengths are in order.
 
     Raises:
         DamageError: the file is truncated or damaged.

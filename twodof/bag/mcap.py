@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -12,6 +12,7 @@ from zlib import crc32
 
 import lz4.frame
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bounds import MAX_CHUNK, MAX_LOOSE, MAX_PROVENANCE, MAX_RATIO
 from ..ros.cdr import Rows
@@ -29,6 +30,7 @@ HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # record header, channel, sequence, two times
 STAMP = slice(15, 23)  # the first of the two times
 MANY = 1000  # records outside chunks that are read at a time
+FEW = 16  # periods that are not read at once, and records between two searches for a period
 
 
 def mcap_messages(path: Path, budget: ReadBudget) -> Iterator[Batch]:
@@ -71,59 +73,62 @@ def read_metadata(path: Path, name: str, key: str) -> str:
 
 
 def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) -> Iterator[Batch]:
-    """Return the messages of a chunk.
+    """Return the messages of a chunk, those of a channel that have equal lengths together: a batch takes 20 µs.
 
-    If messages of equal lengths repeat periodically, as they mostly do in bags of ROS 2, all of them are read at once:
-    one by one, each would take a microsecond.
+    If records repeat periodically, as they mostly do in bags of ROS 2, all of them are read at once: one by one, each
+    would take a microsecond.
     """
-    position = 0
-    seen: dict[bytes, int] = {}  # headers of the latest message records, and their offsets
+    position = patience = 0
+    seen: dict[bytes, int] = {}  # different headers of the latest message records, and their offsets
+    waiting: dict[bytes, list[int]] = {}  # offsets by header
+    every = np.frombuffer(chunk, np.uint8)
 
-    def alone(offsets: Iterable[int]) -> Iterator[Batch]:
-        for offset in offsets:
-            yield tables.batch(path, np.frombuffer(chunk, np.uint8, offset=offset)[None])
+    def gathered() -> Iterator[Batch]:
+        for head, offsets in waiting.items():
+            size = HEAD.size + HEAD.unpack_from(head)[1]
+            yield tables.batch(path, np.lib.stride_tricks.sliding_window_view(every, size)[offsets])
+        waiting.clear()
 
     while position + HEAD.size <= len(chunk):
         opcode, length = HEAD.unpack_from(chunk, position)
         end = position + HEAD.size + length
         if end > len(chunk) or not opcode:
             break
-        head = chunk[position : position + HEAD.size + 2]
-        if head in seen:
-            turn = [offset for offset in seen.values() if offset >= seen[head]]
-            yield from alone([*seen.values()][: -len(turn)])
-            rows = _turns(chunk, turn, position)
-            budget.spend(RECORD * (len(rows) - 1) * len(turn))
-            for offset in turn:
-                yield tables.batch(path, rows[:, offset - turn[0] :])
-            position, seen = turn[0] + rows.size, {}
-            continue
         budget.spend(RECORD)
-        if opcode == MESSAGE:
-            seen[head] = position
-        elif opcode in (SCHEMA, CHANNEL):
-            yield from alone(seen.values())
+        head = chunk[position : position + HEAD.size + 2]
+        if opcode in (SCHEMA, CHANNEL):
+            yield from gathered()
             seen = {}
             budget.spend(TEXT * length)
             tables.add(path, opcode, chunk, position + HEAD.size)
+        elif opcode == MESSAGE and head in seen and not patience:
+            turn = [offset for offset in seen.values() if offset >= seen[head]]
+            rows = _turns(every[turn[0] :], [offset - turn[0] for offset in turn], position - turn[0])[1:]
+            seen = {}
+            if len(rows) > FEW:
+                budget.spend(RECORD * (len(rows) * len(turn) - 1))
+                yield from gathered()
+                for offset in turn:
+                    yield tables.batch(path, rows[:, offset - turn[0] :])
+                position += rows.size
+                continue
+            patience = FEW  # each search takes 20 µs
+        if opcode == MESSAGE:
+            waiting.setdefault(head, []).append(position)
+            if patience:
+                patience -= 1
+            else:
+                seen[head] = position
         position = end
-    yield from alone(seen.values())
+    yield from gathered()
     if position < len(chunk):
         raise DamageError(f"'{path.name}' has a damaged chunk")
 
 
-def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
-    """Return periodic records as rows; a period consists of the records from the first offset to the end.
-
-    If a channel occurs twice in a period, return the first row only, so that the channel's messages stay in order.
-    """
-    every = np.frombuffer(chunk, np.uint8, offset=turn[0])
-    length = end - turn[0]
+def _turns(every: NDArray[np.uint8], turn: Sequence[int], length: int) -> Rows:
+    """Return periodic records as rows; a period has this length, and its records begin at the offsets of the turn."""
     rows = every[: len(every) // length * length].reshape(-1, length)
-    heads = np.concatenate([np.arange(offset, offset + HEAD.size + 2) for offset in turn]) - turn[0]
-    channels = {chunk[offset + HEAD.size : offset + HEAD.size + 2] for offset in turn}
-    if len(channels) < len(turn):
-        return rows[:1]
+    heads = np.concatenate([np.arange(offset, offset + HEAD.size + 2) for offset in turn])
     count, ahead = 1, 16
     while count < len(rows):
         same = (rows[count : count + ahead, heads] == rows[0, heads]).all(axis=1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
-from ..bounds import MAX_HELD, MAX_PROVENANCE, MAX_ROBOTS
+from ..bounds import CHANGE, MAX_HELD, MAX_PROVENANCE, MAX_ROBOTS
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..fmu import System
@@ -258,7 +258,7 @@ def _limited(provenance: Provenance) -> Provenance:
     names, room = set[str](), MAX_HELD
     for i, (time, values) in enumerate(provenance["input_changes"]):
         names.update(values)
-        room -= len(names)
+        room -= len(names) + CHANGE
         if room < 0:
             provenance["input_changes"] = provenance["input_changes"][:i]
             provenance[KNOWN_UNTIL] = time

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import logging
-import struct
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from ..bounds import MAX_DRAWN, MAX_JOINT_STATE, MAX_ODD, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
+from ..bounds import MAX_DRAWN, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
 from ..errors import BagError, no_such, path_of
 from ..files import is_being_written, shown
-from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
-from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
+from ..ros.cdr import Rows
+from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET
 from .contents import read_messages, stated_count, storage_files
-from .downsampling import Downsampler, Indices
+from .downsampling import Downsampler
+from .joint_states import Ends, JointStates, Targets
 from .provenance import file_of, read_provenance, robot_in, robots_of
-from .recording import Array, ReceivedTargets, Recording, TopicCount
-from .records import DamageError, ReadBudget, Stamps
-from .summary import read_summary
-
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+from .recording import Array, Inputs, Recording, TopicCount
+from .records import Channel, DamageError, ReadBudget, Stamps
+from .summary import McapSummary, read_summary
 
 LOG = logging.getLogger(__name__)
 
@@ -39,7 +34,7 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: the path is not a bag, or the bag is unfinished, damaged or without joint states.
     """
-    return _read(path_of(path, "bag"), _JointStates, _Targets())
+    return _read([_Robot(path_of(path, "bag"), JointStates, Targets())])[0]
 
 
 def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
@@ -48,42 +43,58 @@ def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], S
     Memory holds at most ``most`` samples and a chunk of the bag. ``lines`` returns the curves of a part of the bag that
     are drawn in addition to positions and velocities; its exceptions are passed on.
     """
-    return _read(Path(path), _JointStates, _Targets(), Downsampler(most, lines))
+    return _read([_Robot(Path(path), JointStates, Targets(), Downsampler(most, lines))])[0]
+
+
+def read_bags(paths: Sequence[str | Path]) -> list[Recording]:
+    """Read robots of one bag as ``read_bag`` does, in one pass."""
+    return _read([_Robot(Path(path), JointStates, Targets()) for path in paths])
 
 
 def read_ends(path: str | Path) -> Recording:
-    """Return the first and the last joint state of a bag.
+    """Return the first and the last joint state of a bag, as ``read_all_ends`` does."""
+    return read_all_ends([Path(path)])[0]
 
-    Use the summaries of the files if all have a valid one; otherwise read the whole bag.
+
+def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
+    """Return the first and the last joint state of robots of one bag.
+
+    Use the summaries of the files if all have a valid one; otherwise read the whole bag once.
 
     Raises:
         BagError: as ``read_bag``.
     """
-    path = Path(path)
-    folder, prefix, others = _place(path)
+    folder, _ = robot_in(paths[0])
     with _refusing(folder):
         summaries = [read_summary(file) for file in whole_bag(folder)]
-        if None in summaries:
-            return _read(path, _Ends, None)
-        counts: Counter[tuple[str, str]] = Counter()
-        total = 0
-        for summary in filter(None, summaries):
-            for number, count in summary.counts.items():
-                channel = summary.channels[number]
-                if _is_within(channel.topic, prefix, others):
-                    counts[channel.topic, channel.type] += count
-                total += count
-        stating = [topic for topic, kind in counts if kind == JOINT_STATE]
-        usual = prefix + JOINT_STATES
-        if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
-            return _read(path, _Ends, None)
-        chosen = usual if usual in stating else "".join(stating)
-        ends, budget = _Ends(path), ReadBudget()
-        for summary in filter(None, summaries):
-            for batch in summary.ends(chosen, budget):
-                ends.add(batch.stamps, batch.messages)
-        _check_count(folder, total)
-        return _recording(path, counts, chosen, ends, None)
+        valid = [summary for summary in summaries if summary is not None]
+        found = [_ends(path, valid) if len(valid) == len(summaries) else None for path in paths]
+    rest = iter(_read([_Robot(path, Ends, None) for path, known in zip(paths, found) if known is None]))
+    return [known or next(rest) for known in found]
+
+
+def _ends(path: Path, summaries: Sequence[McapSummary]) -> Recording | None:
+    """Return the ends of a robot's joint states by the summaries; None if these do not decide on the topic."""
+    folder, prefix, others = _place(path)
+    counts: Counter[tuple[str, str]] = Counter()
+    total = 0
+    for summary in summaries:
+        for number, count in summary.counts.items():
+            channel = summary.channels[number]
+            if _is_within(channel.topic, prefix, others):
+                counts[channel.topic, channel.type] += count
+            total += count
+    stating = [topic for topic, kind in counts if kind == JOINT_STATE]
+    usual = prefix + JOINT_STATES
+    if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
+        return None
+    chosen = usual if usual in stating else "".join(stating)
+    ends, budget = Ends(path), ReadBudget()
+    for summary in summaries:
+        for batch in summary.ends(chosen, budget):
+            ends.add(batch.stamps, batch.messages)
+    _check_count(folder, total)
+    return _recording(path, counts, chosen, ends, None, Inputs(read_provenance(*robot_in(path))))
 
 
 def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
@@ -112,53 +123,77 @@ def _refusing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _read(
-    path: Path, kind: type[_JointStates], targets: _Targets | None, downsampler: Downsampler | None = None
-) -> Recording:
-    """Read a bag's joint states with the given accumulator, and downsample them."""
-    counts: Counter[tuple[str, str]] = Counter()
-    chosen, states, total = "", kind(path), 0
-    budget, thinned, most = ReadBudget(), False, MAX_SAMPLES
+class _Robot:
+    """Joint states and targets of a robot, while its bag is read; with a downsampler, a choice of them."""
 
-    def thin(downsampler: Downsampler) -> None:
-        states.keep(downsampler.choose(_recording(path, counts, chosen, states, targets)))
+    def __init__(
+        self, path: Path, kind: type[JointStates], targets: Targets | None, downsampler: Downsampler | None = None
+    ) -> None:
+        self.path, self.downsampler = path, downsampler
+        self.folder, self._prefix, self._others = _place(path)
+        self._kind, self._targets = kind, targets
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._chosen, self.states, self._thinned = "", kind(path), False
 
-    folder, prefix, others = _place(path)
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return Inputs(read_provenance(*robot_in(self.path)))
+
+    def add(self, channel: Channel, stamps: Stamps, messages: Rows) -> None:
+        """Add messages of any topic of the bag."""
+        if not _is_within(channel.topic, self._prefix, self._others):
+            return
+        self._counts[channel.topic, channel.type] += len(stamps)
+        if channel.type == JOINT_STATE:
+            usual = channel.topic == self._prefix + JOINT_STATES
+            if channel.topic != self._chosen and (not self._chosen or usual):
+                self._chosen, self.states = channel.topic, self._kind(self.path)
+            if channel.topic == self._chosen:
+                self.states.add(stamps, messages)
+                if self.downsampler is not None:
+                    self.downsampler.most = min(self.downsampler.most, MAX_DRAWN * len(self.states) // self.states.size)
+                    if len(self.states) > self.downsampler.most:
+                        self._thin(self.downsampler)
+        elif self._targets and channel.topic == self._prefix + TARGET and channel.type in (POINT, POSE):
+            self._targets.add(stamps, messages)
+
+    def _thin(self, downsampler: Downsampler) -> None:
+        self._thinned = True
+        self.states.keep(downsampler.choose(self._made()))
+
+    def _made(self) -> Recording:
+        return _recording(self.path, self._counts, self._chosen, self.states, self._targets, self._inputs)
+
+    def recording(self) -> Recording:
+        """Return the recording at the end of the bag."""
+        stating = [topic for topic, kind in self._counts if kind == JOINT_STATE]
+        if len(stating) > 1 and self._chosen != self._prefix + JOINT_STATES:
+            topics = ", ".join(map(shown, stating))
+            LOG.warning(f"'{self.path}' has several topics of joint states, {topics}; {shown(self._chosen)} is read")
+        if self.downsampler is not None and self._thinned:
+            self._thin(self.downsampler)  # downsample the end like the rest
+        return self._made()
+
+
+def _read(robots: Sequence[_Robot]) -> list[Recording]:
+    """Read a bag once, for some of its robots."""
+    if not robots:
+        return []
+    budget, total, most, folder = ReadBudget(), 0, MAX_SAMPLES, robots[0].folder
     with _refusing(folder):
         files = whole_bag(folder)
-        if downsampler is None:  # a bag of a few MB may unpack to gigabytes
+        if robots[0].downsampler is None:  # a bag of a few MB may unpack to gigabytes
             most = min(most, MAX_DRAWN + MAX_SAMPLES_RATIO * sum(file.stat().st_size for file in files))
         for file in files:
             for channel, stamps, messages in read_messages(file, budget):
                 total += len(stamps)
-                if not _is_within(channel.topic, prefix, others):
-                    continue
-                counts[channel.topic, channel.type] += len(stamps)
-                if channel.type == JOINT_STATE:
-                    usual = channel.topic == prefix + JOINT_STATES
-                    if channel.topic != chosen and (not chosen or usual):
-                        chosen, states = channel.topic, kind(path)
-                    if channel.topic == chosen:
-                        states.add(stamps, messages)
-                        if states.size > most:
-                            much = f"{most // MIB} MiB of joint states"
-                            raise BagError(f"'{path}' unpacks to more than {much}; cut it into several bags")
-                        if downsampler is not None:
-                            downsampler.most = min(downsampler.most, MAX_DRAWN * len(states) // states.size)
-                            if len(states) > downsampler.most:
-                                thin(downsampler)
-                                thinned = True
-                elif targets and channel.topic == prefix + TARGET and channel.type in (POINT, POSE):
-                    targets.add(stamps, messages)
+                for robot in robots:
+                    robot.add(channel, stamps, messages)
+                if channel.type == JOINT_STATE and sum(robot.states.size for robot in robots) > most:
+                    much = f"{most // MIB} MiB of joint states"
+                    raise BagError(f"'{robots[0].path}' unpacks to more than {much}; cut it into several bags")
         _check_count(folder, total)
-    stating = [topic for topic, kind in counts if kind == JOINT_STATE]
-    if len(stating) > 1 and chosen != prefix + JOINT_STATES:
-        LOG.warning(
-            f"'{path}' has several topics of joint states, {', '.join(map(shown, stating))}; {shown(chosen)} is read"
-        )
-    if downsampler is not None and thinned:
-        thin(downsampler)  # downsample the end like the rest
-    return _recording(path, counts, chosen, states, targets)
+    return [robot.recording() for robot in robots]
 
 
 def _check_count(path: Path, count: int) -> None:
@@ -172,7 +207,12 @@ def _check_count(path: Path, count: int) -> None:
 
 
 def _recording(
-    path: Path, counts: Counter[tuple[str, str]], chosen: str, states: _JointStates, targets: _Targets | None
+    path: Path,
+    counts: Counter[tuple[str, str]],
+    chosen: str,
+    states: JointStates,
+    targets: Targets | None,
+    inputs: Inputs,
 ) -> Recording:
     if not counts[chosen, JOINT_STATE]:
         _, robot = robot_in(path)
@@ -189,7 +229,8 @@ def _recording(
         v=v,
         tau=tau,
         received=targets.received(stamps) if targets is not None else None,
-        provenance=read_provenance(*robot_in(path)),
+        provenance=inputs.provenance,
+        inputs=inputs,
     )
 
 
@@ -204,143 +245,3 @@ def whole_bag(path: Path) -> list[Path]:
             raise BagError(f"the bag '{path}' is still being written")
         raise BagError(f"the bag '{path}' is unfinished: its writer died; repair it with 'twodof recover {path}'")
     return files
-
-
-class _JointStates:
-    """Joint states of one topic, decoded incrementally."""
-
-    def __init__(self, path: Path) -> None:
-        self.names: tuple[str, ...] = ()
-        self._path = path
-        self._layout: Layout | None = None
-        self._sizes: tuple[int, ...] = ()
-        self._odd = 0  # bytes that were decoded one by one
-        self._stamps = array("q")
-        self._numbers = [array("d") for _ in range(3)]
-
-    def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add N joint states."""
-        numbers = self._decoded(messages)
-        self._stamps.frombytes(stamps.tobytes())
-        for stored, part in zip(self._numbers, numbers, strict=True):
-            stored.frombytes(part.tobytes())
-
-    def __len__(self) -> int:
-        return len(self._stamps)
-
-    @property
-    def size(self) -> int:
-        """Bytes of all states."""
-        return 8 * (len(self._stamps) + sum(map(len, self._numbers)))
-
-    def keep(self, chosen: Indices) -> None:
-        """Keep only the states at these indices of the arrays that ``arrays`` returns."""
-        stamps, *numbers = self.arrays()
-        self._stamps = array("q", stamps[chosen].tobytes())
-        self._numbers = [array("d", part[chosen].tobytes()) for part in numbers]
-
-    def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Return stamps, positions, velocities and efforts by ascending stamps."""
-        stamps = np.asarray(self._stamps)
-        q, v, effort = (np.asarray(n).reshape(len(stamps), -1) for n in self._numbers)
-        if np.any(np.diff(stamps) < 0):
-            order = np.argsort(stamps, kind="stable")
-            stamps, q, v, effort = stamps[order], q[order], v[order], effort[order]
-        return stamps, q, v, effort
-
-    def _decoded(self, messages: Rows) -> list[Array]:
-        if messages.shape[1] > MAX_JOINT_STATE:
-            raise BagError(f"'{self._path}' has a joint state of {messages.shape[1]} bytes")
-        message = messages[0].tobytes()
-        try:
-            if self._layout is None:
-                frame, self.names, *parts = _deserialised(message)
-                self._sizes = tuple(map(len, parts))
-                self._layout = joint_state_layout(self.names, frame, self._sizes)
-            numbers = self._layout.unpack(messages)
-            if numbers is None:
-                self._odd += messages.nbytes
-                if self._odd > MAX_ODD:
-                    raise BagError(
-                        f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form"
-                    )
-                numbers = [np.array(part, np.float64) for part in zip(*map(self._decode_one, messages), strict=True)]
-            return numbers
-        except BagError:
-            raise
-        except MixtureError as error:
-            raise BagError(f"'{self._path}' has joint states of different {error}") from error
-        except Exception as error:  # rosbags raises any exception for bytes that are not a JointState
-            packed = message.startswith(ZSTD_MAGIC)
-            reason = "its messages are compressed" if packed else "a joint state is damaged"
-            raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
-
-    def _decode_one(self, message: Rows) -> list[Array]:
-        """Decode a message whose frame, byte order or padding differs from the first one's."""
-        _, names, *parts = _deserialised(message.tobytes())
-        if names != self.names:
-            raise MixtureError("joints")
-        if tuple(map(len, parts)) != self._sizes:
-            raise MixtureError("sizes")
-        return parts
-
-
-def _deserialised(message: bytes) -> tuple[Any, ...]:
-    """Return frame, names, positions, velocities and efforts of a JointState."""
-    state: Any = store_of(JOINT_STATE).deserialize_cdr(message, JOINT_STATE)
-    return state.header.frame_id, tuple(state.name), state.position, state.velocity, state.effort
-
-
-class _Ends(_JointStates):
-    """First and last joint state of one topic."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._ends: list[tuple[int, Rows]] = []
-
-    def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add N joint states."""
-        first, last = int(np.argmin(stamps)), len(stamps) - 1 - int(np.argmax(stamps[::-1]))
-        some = [*self._ends, *((int(stamps[k]), messages[k : k + 1]) for k in (first, last))]
-        earliest = min(some, key=lambda end: end[0])
-        self._ends = [earliest, max(reversed(some), key=lambda end: end[0])]
-
-    def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Return stamps, positions, velocities and efforts of both states."""
-        for stamp, message in self._ends:
-            super().add(np.array([stamp]), message)
-        return super().arrays()
-
-
-class _Targets:
-    """Points on /target, all in one frame."""
-
-    def __init__(self) -> None:
-        self._frame: bytes | None = None
-        self._sound = True
-        self._stamps, self._points = array("q"), array("d")
-
-    def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add PointStampeds, or PoseStampeds, which begin alike."""
-        try:
-            frame, points = unpack_points(messages)
-        except (MixtureError, IndexError, struct.error):
-            self._sound = False
-            return
-        self._sound &= self._frame in (None, frame)
-        self._frame = frame
-        new = np.ones(len(stamps), bool)  # repeated points are dropped
-        new[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
-        self._stamps.frombytes(stamps[new].tobytes())
-        self._points.frombytes(points[new].tobytes())
-
-    def received(self, stamps: Stamps) -> ReceivedTargets | None:
-        """Return the latest target at each stamp; None without targets, or if they are in several frames."""
-        if self._frame is None or not self._sound:
-            return None
-        own = np.asarray(self._stamps)
-        order = np.argsort(own, kind="stable")
-        points = np.asarray(self._points).reshape(-1, 3)[order]
-        latest = np.searchsorted(own[order], stamps, side="right") - 1
-        received = np.where((latest >= 0)[:, None], points[latest], np.nan)
-        return ReceivedTargets(self._frame.decode("utf-8", "replace"), received)

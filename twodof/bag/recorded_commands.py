@@ -136,14 +136,17 @@ def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Se
 
 def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read], bag: str) -> list[tuple[int, Read]]:
     """Return the time and content of each command; errors name the bag."""
-    read_so_far = []
+    read_so_far, names = [], set[str]()
     for came, kind, data in commands:
         try:
-            read_so_far.append((came, read(came, kind, data)))
+            command = read(came, kind, data)
         except CommandError as error:
             t = (came - begin) / NANOSECONDS
             raise InputError(f"{bag}: the command at {t:g} s {error}") from error
-    if names := {name for _, command in read_so_far for name in command.unknown_joints}:
+        if len(names) < LONGEST_NAME:  # a message may name thousands, which take three times its bytes
+            names.update(command.unknown_joints[:LONGEST_NAME])
+        read_so_far.append((came, command._replace(unknown_joints=())))
+    if names:
         unknown_joints = ", ".join(sorted(names))[:LONGEST_NAME]
         LOG.warning(f"{bag}: joints that this robot does not have are ignored: {unknown_joints!r}")
     return read_so_far

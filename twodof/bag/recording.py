@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -62,6 +63,37 @@ class ReceivedTargets:
     points: Array
 
 
+class Inputs:
+    """Inputs and parameters of a run over time; a bag has one for all its recordings, as the changes may be many."""
+
+    def __init__(self, provenance: Provenance) -> None:
+        self.provenance, self._tables = provenance, dict[tuple[str, ...], tuple[list[int], Array]]()
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """Values with the communication point from which on they apply."""
+        run = self.provenance
+        starts, changes = run.get("start_values", {}), run.get("input_changes", [])
+        if not all(map(isfinite, chain(starts.values(), *(values.values() for _, values in changes)))):
+            raise ValueError("values are not finite")
+        schedule: Schedule = [(0, ChainMap({}, starts))]
+        changed: dict[str, Value] = {}
+        for time, values in changes:
+            k = max(0, ceil((time - run["start_time"]) / run["step"] - TIME_TOLERANCE))
+            changed = {**changed, **values}
+            if k == schedule[-1][0] and len(schedule) > 1:  # no change precedes the first sample
+                schedule.pop()
+            schedule.append((k, ChainMap(changed, starts)))
+        return schedule
+
+    def table(self, names: tuple[str, ...]) -> tuple[list[int], Array]:
+        """Return the communication points of the schedule, and the values of some variables from each on."""
+        if names not in self._tables:
+            values = np.array([[float(held[name]) for name in names] for _, held in self.schedule])
+            self._tables[names] = [k for k, _ in self.schedule], values
+        return self._tables[names]
+
+
 @dataclass(frozen=True, repr=False)
 class Recording:
     """A bag read back: N samples of n joints and m task axes.
@@ -78,6 +110,7 @@ class Recording:
         tau: efforts (N·m, N), N × n, or N × 0 without efforts.
         received: points received on /target; None without such points.
         provenance: content of run.json, {} for a third-party bag.
+        inputs: the inputs in the provenance, evaluated once for all recordings of a bag.
 
     Raises:
         BagError: attributes from the provenance raise it if the provenance does not fit the samples, and ``steps``
@@ -94,6 +127,7 @@ class Recording:
     tau: Array
     received: ReceivedTargets | None
     provenance: Provenance
+    inputs: Inputs | None = None
 
     def __repr__(self) -> str:
         return f"<Recording '{self.path}': {self.count} samples in {self.t[-1]:g} s of {', '.join(self.joints)}>"
@@ -119,23 +153,21 @@ class Recording:
         return any(topic.name.endswith(TRUE_STATES) for topic in self.topics)
 
     @cached_property
+    def _inputs(self) -> Inputs:
+        known = self.inputs
+        return known if known is not None and known.provenance is self.provenance else Inputs(self.provenance)
+
+    @cached_property
     def schedule(self) -> Schedule:
         """Values of inputs and parameters, with the communication point from which on they apply."""
-        try:
-            starts = self.provenance.get("start_values", {})
-            changes = self.provenance.get("input_changes", [])
-            if not all(map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))):
-                raise ValueError("values are not finite")
-            schedule: Schedule = [(0, ChainMap({}, starts))]
-            changed: dict[str, Value] = {}
-            for time, values in changes:
-                k = max(0, ceil((time - self.provenance["start_time"]) / self.provenance["step"] - TIME_TOLERANCE))
-                changed = {**changed, **values}
-                if k == schedule[-1][0] and len(schedule) > 1:  # no change precedes the first sample
-                    schedule.pop()
-                schedule.append((k, ChainMap(changed, starts)))
+        with self._fitting():
             last = self.steps[-1] if self.provenance else 0
-            return [(k, values) for k, values in schedule if k < last or k == 0]
+            return [(k, values) for k, values in self._inputs.schedule if k < last or k == 0]
+
+    @contextmanager
+    def _fitting(self) -> Iterator[None]:
+        try:
+            yield
         except (KeyError, ValueError, ArithmeticError) as error:
             raise BagError(f"the run.json in '{self.path}' does not fit its samples") from error
 
@@ -171,13 +203,12 @@ class Recording:
 
     def held(self, group: str, size: int) -> Array:
         """Return a vector of inputs in effect up to each sample, N × size; N × 0 if unknown."""
-        names = [f"{group}[{i + 1}]" for i in range(size)]
+        names = tuple(f"{group}[{i + 1}]" for i in range(size))
         if not size or names[0] not in self.schedule[0][1] or KNOWN_UNTIL in self.provenance:
             return np.empty((len(self.stamps), 0))
-        begins = [k for k, _ in self.schedule]
-        values = np.array([[float(held[name]) for name in names] for _, held in self.schedule])
+        begins, values = self._inputs.table(names)
         # a change has no effect yet at its own communication point
-        return cast(Array, values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
+        return values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)]
 
     @property
     def setup(self) -> Setup:

@@ -16,7 +16,17 @@ from rosbags.rosbag2 import Reader, ReaderError, WriterError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from ..bounds import MAX_DEFINITION, MAX_DEFINITIONS, MAX_MESHES, MAX_PROFILES, MAX_PROVENANCE, MAX_PROVENANCES, MIB
+from ..bounds import (
+    MAX_COPY,
+    MAX_COPY_RATIO,
+    MAX_DEFINITION,
+    MAX_DEFINITIONS,
+    MAX_MESHES,
+    MAX_PROFILES,
+    MAX_PROVENANCE,
+    MAX_PROVENANCES,
+    MIB,
+)
 from ..errors import BagError, no_such
 from ..files import lock, read_file, sync
 from . import provenance
@@ -149,8 +159,9 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
                 room -= len(text)
                 if room >= 0:
                     writer.set_custom_data(provenance.key_of(robot), text)
+    most = MAX_COPY + MAX_COPY_RATIO * sum(file.stat().st_size for file in files)
     with writer:
-        topics, pending = _Topics(writer), 0
+        topics, pending, written = _Topics(writer), 0, 0
         for file in files:
             try:
                 for channel, stamps, messages in read_messages(file, budget):
@@ -159,10 +170,13 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
                         continue
                     number = topics.connection(channel).id
                     size = OVERHEAD + messages.shape[1]
-                    most = max(1, BATCH_SIZE // size)
-                    for k in range(0, len(stamps), most):
-                        writer.write_all(stamps[k : k + most], {number: messages[k : k + most]})
-                        pending += size * len(stamps[k : k + most])
+                    written += size * len(stamps)
+                    if written > most:
+                        raise BagError(f"'{folder}' unpacks to more than {most // MIB} MiB of messages; cut its files")
+                    some = max(1, BATCH_SIZE // size)
+                    for k in range(0, len(stamps), some):
+                        writer.write_all(stamps[k : k + some], {number: messages[k : k + some]})
+                        pending += size * len(stamps[k : k + some])
                         if pending > BATCH_SIZE:
                             writer.flush()
                             pending = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from ..simulation.verdict import Verdict
 
 
-MOST_JUDGED = 200_000  # samples, of up to 10 joints, of a bag without a stored verdict, which takes a second to judge
+MOST_JUDGED = 200_000  # samples of up to 10 joints without a stored verdict, which take a second to judge
 
 
 def add(info: Parser) -> None:
@@ -65,17 +66,18 @@ def call(options: argparse.Namespace) -> int:
 
 def _show_bags(path: Path, as_json: bool) -> None:
     from ..bag.provenance import each_robot
-    from ..bag.reader import read_ends
+    from ..bag.reader import read_all_ends
 
-    bags = [read_ends(robot) for robot in each_robot(path)]
+    bags = read_all_ends(each_robot(path))
+    verdicts = _verdicts_of(bags)
     if as_json:
-        facts = [_bag_facts(bag) for bag in bags]
+        facts = [*map(_bag_facts, bags, verdicts)]
         print_json(**facts[0] if len(facts) == 1 else dict(kind="bag", path=str(path), robots=facts))
         return
-    for i, bag in enumerate(bags):
+    for i, (bag, verdict) in enumerate(zip(bags, verdicts)):
         if i > 0:
             say()
-        _print_bag(bag)
+        _print_bag(bag, verdict)
 
 
 def _print_fmu_json(fmu: Fmu) -> None:
@@ -95,8 +97,7 @@ def _print_fmu_json(fmu: Fmu) -> None:
     )
 
 
-def _bag_facts(bag: Recording) -> dict[str, object]:
-    verdict = _verdict_of(bag)
+def _bag_facts(bag: Recording, verdict: Verdict | None) -> dict[str, object]:
     return dict(
         kind="bag",
         path=str(bag.path),
@@ -219,7 +220,7 @@ def _start(text: str) -> str:
     return "none" if abs(value) > 1e300 else f"{value:g}"
 
 
-def _print_bag(run: Recording) -> None:
+def _print_bag(run: Recording, verdict: Verdict | None) -> None:
     duration = float(run.t[-1])
     rate = (run.count - 1) / duration if duration else 0.0
     rows = [
@@ -234,20 +235,23 @@ def _print_bag(run: Recording) -> None:
         fmu = run.provenance["fmu"]
         rows.append(("FMU", f"{fmu['file']} ({fmu['name']}, {fmu['guid']})"))
         rows.append(("made by", run.provenance["command_line"] or "the Python API"))
-    if (verdict := _verdict_of(run)) is not None:
+    if verdict is not None:
         rows += verdict_rows(verdict.lines)
     print_table(*rows)
     say()
     print_table(*((topic.name, f"{topic.count:8d}", topic.type) for topic in run.topics))
 
 
-def _verdict_of(run: Recording) -> Verdict | None:
-    """Return the stored verdict of a bag, or that of its samples if there are few; else None."""
-    from ..bag.reader import read_bag
+def _verdicts_of(runs: Sequence[Recording]) -> list[Verdict | None]:
+    """Return the stored verdicts of a bag's robots; for those without one, that of their samples if there are few."""
+    from ..bag.reader import read_bags
 
-    stored = run.stored_verdict
-    few = run.count * max(10, len(run.joints)) <= 10 * MOST_JUDGED
-    return read_bag(run.path).verdict if stored is None and few else stored
+    stored = [run.stored_verdict for run in runs]
+    unknown = [run for run, verdict in zip(runs, stored) if verdict is None]
+    if not unknown or sum(run.count * max(10, len(run.joints)) for run in unknown) > 10 * MOST_JUDGED:
+        return stored
+    read = iter(read_bags([run.path for run in unknown]))
+    return [next(read).verdict if verdict is None else verdict for verdict in stored]
 
 
 def _state(run: Recording, k: int) -> str:

@@ -15,7 +15,7 @@ from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_ROW, MIN_STEP
 from ..children import Child, limit
 from ..errors import FmuError, InputError, SspError
 from ..export.package import has_member
-from ..files import temporary_folder
+from ..files import parsed, temporary_folder
 from ..notebook import card
 from .description import Fmu, load_any_fmu, problems_of
 from .importers import require
@@ -167,7 +167,7 @@ def _tried(fmu: Fmu, tasks: Sequence[_Task]) -> Iterator[Row]:
         ):
             try:
                 while waiting:
-                    kind, *words = json.loads(child.receive(MAX_ROW, MAX_CALL_WAIT))
+                    kind, *words = parsed(child.receive(MAX_ROW, MAX_CALL_WAIT))
                     if kind == "row":
                         yield Row(waiting.pop(0).name, *words)
                     else:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import posixpath
 import zipfile
+from array import array
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -19,7 +21,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_REFERENCES
+from ..bounds import MAX_CELLS, MAX_REFERENCES
 from ..errors import FmuError, SimulationError
 from ..files import read_member
 from .description import Fmu, opened
@@ -154,7 +156,7 @@ class _Files:
     """
 
     def __init__(self, archive: zipfile.ZipFile, folder: str) -> None:
-        self._archive, self._folder, self._room = archive, folder, MAX_REFERENCES
+        self._archive, self._folder, self._room, self._cells = archive, folder, MAX_REFERENCES, MAX_CELLS
         self.digests: dict[str, str] = {}
 
     def read(self, source: str) -> bytes:
@@ -195,14 +197,26 @@ class _Files:
         read: dict[str, Callable[[str], float | bool]] = {**NUMBERS, "Float64": float, "Int32": int}
         values: Values = {}
         for parameter in self.xml(source).iterfind(".//{*}Parameter"):
-            for kind in parameter:
-                values[parameter.get("name", "")] = read[kind.tag.rpartition("}")[2]](kind.get("value", "").strip())
+            for element in parameter:
+                name, kind = parameter.get("name", ""), element.tag.rpartition("}")[2]
+                if kind in read:
+                    values[name] = read[kind](element.get("value", "").strip())
+                elif kind != "Annotations":
+                    raise ValueError(f"{source}: parameter '{name}' is of type {kind}, which is not set")
         return values
 
     def table(self, source: str) -> Table:
         """Return the columns of a CSV file."""
-        head, *rows = csv.reader(self.read(source).decode("utf-8").splitlines())
-        numbers = np.array([[float(TRUTHS.get(cell.strip(), cell)) for cell in row] for row in rows])
-        if numbers.ndim != 2 or numbers.shape[1] != len(head) or not np.isfinite(numbers).all():
+        rows = csv.reader(io.StringIO(self.read(source).decode("utf-8"), newline=""))
+        head, cells = next(rows, []), array("d")
+        for row in rows:
+            self._cells -= max(1, len(row))
+            if self._cells < 0:
+                raise ValueError(f"{source}: the tables have more than {MAX_CELLS} cells")
+            if len(row) != len(head):
+                raise ValueError(f"{source} has {len(row)} cells in line {rows.line_num}, and {len(head)} in its first")
+            cells.extend(float(TRUTHS.get(cell.strip(), cell)) for cell in row)
+        numbers = np.array(cells).reshape(-1, max(1, len(head)))
+        if not numbers.size or not np.isfinite(numbers).all():
             raise ValueError(f"{source} is not a table of finite numbers")
         return head[1:], numbers

@@ -12,6 +12,7 @@ IEEE Transactions on Robotics and Automation 13(5), 1997.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
@@ -35,6 +36,7 @@ from .stretches import Array, Stretch
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+LOG = logging.getLogger(__name__)
 SHORTEST, LONGEST = 5.0, 120.0  # s
 HARMONICS, HIGHEST = 6, 1.0
 """Number of harmonics of a joint, and the highest frequency, Hz."""
@@ -46,6 +48,8 @@ COARSE, FINE = 0.1, 0.002
 """Time between samples of the design and of the result, s."""
 CANDIDATES, GENERATIONS, BOUND = 30, 60, 6.0
 """Number of random motions from which the search begins, its steps, and the bound of its coefficients."""
+MOST_WORK = 4e9
+"""Work of a search, some minutes: samples × joints × p (p + 20) of each evaluation, for p parameters."""
 HALVINGS = 8
 """Bisections of the size of a motion to the effort limits."""
 
@@ -169,6 +173,23 @@ class _Design:
         return float(0.5 * np.linalg.slogdet(covariance)[1] / len(covariance))
 
 
+def _generations(seconds: float, joints: int, parameters: int) -> int:
+    """Return the number of steps of a search of limited work; the candidates are evaluated twice before."""
+    work = seconds / COARSE * joints * parameters * (parameters + 20)
+    generations = min(GENERATIONS, int(MOST_WORK / work) // CANDIDATES - 2)
+    if generations < 1:
+        raise InputError(
+            f"a motion of {seconds:g} s for {parameters} parameters of {joints} joints takes too long to design;"
+            " `free` fewer parameters, or `lock` joints"
+        )
+    if generations < GENERATIONS:
+        LOG.warning(
+            f"the search for the motion ends after {generations} of {GENERATIONS} steps, because {parameters}"
+            f" parameters of {joints} joints take long; with fewer parameters the motion may be better"
+        )
+    return generations
+
+
 @with_keywords_of(read_model)
 def excite(
     urdf: str | Path,
@@ -181,7 +202,8 @@ def excite(
 ) -> Excitation:
     """Return a motion within the limits of the URDF from whose recording a fit is most precise.
 
-    Collisions are not considered. The design is the same on each call.
+    Collisions are not considered. The design is the same on each call. For many joints and parameters the search ends
+    early, with a warning.
 
     Args:
         urdf, free, frame, lock, gravity, progress: as for ``fit``; ``gravity`` None: (0, 0, −9.81).
@@ -189,14 +211,15 @@ def excite(
         output: CSV file of the motion; None: nothing is written.
 
     Raises:
-        InputError: the duration is out of range, a pattern matches no parameter, an effort limit does not hold the
-            robot, or the file cannot be written.
+        InputError: the duration is out of range, a pattern matches no parameter, there are too many parameters, an
+            effort limit does not hold the robot, or the file cannot be written.
         BuildError: the URDF cannot be read.
     """
     if not SHORTEST <= seconds <= LONGEST:
         raise InputError(f"a motion of {seconds:g} s is not possible: between {SHORTEST:g} and {LONGEST:g} s")
     model = read_model(urdf, free, **options)
     parameters, robot = model.parameters(options.get("gravity") or GRAVITY), model.robot
+    generations = _generations(seconds, len(robot.joints), len(parameters.free))
     known = model.locked.joints.values()
     own = [[j.velocity / abs(j.ratio) for j in known if j.ratio and j.leader == name] for name in robot.joints]
     design = _Design(robot, [min(each) for each in own], parameters, seconds)
@@ -208,10 +231,10 @@ def excite(
 
     def finished(intermediate_result: object) -> None:
         if progress:
-            progress(next(steps), GENERATIONS)
+            progress(next(steps), generations)
 
     best = differential_evolution(
-        design.cost, [(-BOUND, BOUND)] * candidates.shape[1], init=candidates, maxiter=GENERATIONS, tol=0.0,
+        design.cost, [(-BOUND, BOUND)] * candidates.shape[1], init=candidates, maxiter=generations, tol=0.0,
         mutation=(0.3, 0.7), recombination=0.5, polish=False, rng=rng, callback=finished,
     )  # fmt: skip
     motion, factor = design.motion(best.x, FINE), float(np.exp(np.median(costs) - best.fun))

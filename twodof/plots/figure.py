@@ -13,11 +13,19 @@ from pathlib import Path
 from string import Template
 from typing import NamedTuple, cast
 
+from ..bounds import MAX_STYLES
 from ..errors import PlotError
-from ..files import data_file, descriptor_of, free_name, head_of, refusing, write_file
+from ..files import data_file, descriptor_of, free_name, head_of, read_file, refusing, write_file
 from ..version import __version__, needing
 from .strokes import GREY, HAIR, INK, Style
 
+STYLES = "matplotlibrc"  # matplotlib reads a file of this name in the working directory while it is imported
+if os.path.lexists(STYLES):
+    try:
+        with refusing(PlotError, f"plot in this folder, move its file '{STYLES}'"):
+            read_file(STYLES, MAX_STYLES).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise PlotError(f"cannot plot in this folder, move its file '{STYLES}': it is not UTF-8 text") from error
 with needing(PlotError, "plot", "view"):
     import matplotlib.style
     from matplotlib.figure import Figure, SubFigure

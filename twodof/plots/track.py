@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
 from ..bag.provenance import KNOWN_UNTIL, robot_in
-from ..bag.reader import read_bag, read_downsampled
+from ..bag.reader import read_bags, read_downsampled
 from ..bag.recording import Recording, Verdict
 from ..bounds import MAX_COMPARED_SIZE, MAX_VALUE, MIB
 from ..errors import BuildError, PlotError
@@ -161,9 +162,11 @@ def read_tracks(
     if len(bags) == 1 and not isinstance(bags[0], Recording):
         return [track(read_downsampled(bags[0], most, lambda part: _lines(track(part))))]
     recordings, size = list[Recording](), 0
-    for bag in bags:
-        recordings.append(bag if isinstance(bag, Recording) else read_bag(bag))
-        size += 0 if isinstance(bag, Recording) else 3 * recordings[-1].q.nbytes
+    for _, group in groupby(bags, key=lambda bag: id(bag) if isinstance(bag, Recording) else robot_in(Path(bag))[0]):
+        given = [*group]
+        paths = [bag for bag in given if not isinstance(bag, Recording)]
+        recordings += read_bags(paths) if paths else [bag for bag in given if isinstance(bag, Recording)]
+        size += sum(3 * bag.q.nbytes for bag in recordings[-len(paths) :]) if paths else 0
         if size > MAX_COMPARED_SIZE:
             raise PlotError(
                 f"the bags have more than {MAX_COMPARED_SIZE // MIB} MiB of joint states; plot fewer of them"
@@ -183,9 +186,7 @@ def _lines(track: Track) -> list[Array]:
 
 
 def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> Track:
-    names = bag.joints or tuple(f"joint {i + 1}" for i in range(bag.q.shape[1]))
-    if not bag.q.size or bag.q.shape[1] != len(names):
-        raise PlotError(f"'{bag.path}' has {bag.q.shape[1]} positions for {len(names)} joints")
+    names = bag.joints
     if urdf is None:
         urdf, source = bag.provenance.get("urdf"), f"the URDF in '{bag.path}'"
     try:

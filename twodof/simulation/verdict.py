@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from math import inf, isfinite
 from typing import Any, NamedTuple
 
@@ -157,10 +157,12 @@ class Verdict:
 
 
 def verdict_in(facts: Mapping[str, Any]) -> Verdict:
-    """Return the verdict from stored ``facts``, which must have the shape SHAPE, with None for infinite numbers."""
+    """Return the verdict from stored ``facts`` of the shape SHAPE, which may have more; None is an infinite number."""
     numbers = {name: inf if value is None else float(value) for name, value in facts["numbers"].items()}
-    found = [Cause(**{**cause, "point": tuple(cause["point"])}) for cause in facts["causes"]]
-    return Verdict(**{**facts, "numbers": numbers, "causes": tuple(found), "lines": tuple(facts["lines"])})
+    causes = [{name: cause[name] for name in Cause._fields if name in cause} for cause in facts["causes"]]
+    found = tuple(Cause(**{**cause, "point": tuple(cause["point"])}) for cause in causes)
+    known = {field.name: facts[field.name] for field in fields(Verdict)}
+    return Verdict(**{**known, "numbers": numbers, "causes": found, "lines": tuple(facts["lines"])})
 
 
 def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:

@@ -1,55 +1,38 @@
 """The table of a sweep: a folder of Parquet files that any reader opens as one table.
 
-During the sweep, rows are stored in parts. At its end, the parts become one file, in the order of the runs. An
-untrusted table is read in bounded memory, or refused. All uses of pyarrow are here.
+During the sweep, rows are stored in parts. At its end, the parts become one file, in the order of the runs. All uses of
+pyarrow are here and in ``stored_table.py``.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from math import prod
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_NUMBER, MAX_PROVENANCE, MAX_RUNS, MAX_SETTINGS, MAX_SWEEP, MAX_VARIED
-from ..children import memory_for
 from ..errors import SweepError, no_such
-from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
+from ..files import is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
 from ..simulation.verdict import METRICS
 from ..version import needing
 from .ranking import RANKED, candidates
 from .runner import Row
+from .stored_table import PART, WHOLE, files_of, named, provenance_in, read_tables, schema_of
 
 with needing(SweepError, "store a table", "sweep"):
     import pandas
     import pyarrow as pa
-    import pyarrow.compute as pc
     import pyarrow.parquet as pq
 
-WHOLE = "runs.parquet"
-PART = re.compile(r"part-(\d{6})\.parquet")
-KEY = b"twodof"
 PERIOD = 1.0  # s between two parts
 COMPARED = ("fmu", "design", "options", "bags")
 """Keys that must be equal to resume a sweep, as must the version of this package."""
-
-SHAPE = {
-    "fmu": {"file": str, "name": str, "guid": str},
-    "design": {"grids": {str: [NUMBER]}, "ranges": {str: [NUMBER]}, "draws": int},
-    "options": {"stop_time": NUMBER, "step": NUMBER, "settings": VALUES},
-    "versions": {"twodof": str},
-    "command_line": str,
-}
-"""Shape of a valid provenance."""
-TEXTS = ["outcome", "message"]
 
 
 class Results:
@@ -79,8 +62,8 @@ class Results:
         *,
         resume: bool = False,
     ) -> None:
-        self.path = _named(Path(path))
-        self._schema = _schema(names, units, provenance)
+        self.path = named(Path(path))
+        self._schema = schema_of(names, units, provenance)
         self._rows: list[Row] = []
         self._part = 0
         self.done: NDArray[np.bool_] = np.zeros(runs, dtype=bool)
@@ -117,7 +100,7 @@ class Results:
         self._write_part([])
 
     def _taken(self) -> SweepError:
-        known = self.path.is_dir() and _files(self.path)
+        known = self.path.is_dir() and files_of(self.path)
         what = "exists; resume it with `resume=True`, or" if known else "exists and is not a sweep;"
         return SweepError(f"'{self.path}' {what} choose another `output`")
 
@@ -126,12 +109,12 @@ class Results:
             raise SweepError(f"there is no sweep '{self.path}' to resume")
         if is_being_written(self.path):
             raise SweepError(f"'{self.path}' is being written by another process")
-        for file, table in _read(_files(self.path)):
-            _check_same(self.path, _provenance(file, table.schema), provenance)
+        for file, table in read_tables(files_of(self.path)):
+            _check_same(self.path, provenance_in(file, table.schema), provenance)
             self._schema = table.schema
             self.done[table.column("run").to_numpy()] = True
             number = PART.fullmatch(file.name)
-            self._part = int(number[1]) + 1 if number else 1
+            self._part = max(self._part, int(number[1]) + 1 if number else 1)
         if not self._part:
             raise SweepError(f"'{self.path}' is not a sweep; there is nothing to resume")
 
@@ -157,12 +140,13 @@ class Results:
 
     def _unite(self) -> None:
         """Write one file with all rows, then remove the parts."""
-        parts = [file for file in _files(self.path) if file.name != WHOLE]
+        parts = [file for file in files_of(self.path) if file.name != WHOLE]
         if parts:
-            tables = pa.concat_tables(table for _, table in _read(parts))
+            tables = pa.concat_tables(table for _, table in read_tables(parts))
             _write(self.path / WHOLE, tables.sort_by("run").combine_chunks())
-        for file in filter(_is_part, self.path.iterdir()):
-            file.unlink()
+        for file in self.path.iterdir():
+            if PART.fullmatch(file.name):
+                file.unlink()
 
 
 class SweepTable(pandas.DataFrame):  # type: ignore[misc]
@@ -188,136 +172,19 @@ def read_sweep(path: str | Path) -> pandas.DataFrame:
     """
     path = Path(path)
     with refusing(SweepError, f"read '{path}'"):
-        files = _files(path) if path.is_dir() else []
+        files = files_of(path) if path.is_dir() else []
     if not files:
         raise SweepError(no_such("sweep", path))
-    table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")
+    table = pa.concat_tables(table for _, table in read_tables(files)).sort_by("run")
     rows = SweepTable(table.to_pandas())
     units = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}
     rows.attrs["units"] = {name: unit.decode("utf-8", "replace") for name, unit in units.items()}
-    rows.attrs["provenance"] = _provenance(files[0], table.schema)
+    rows.attrs["provenance"] = provenance_in(files[0], table.schema)
     return rows
 
 
-def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, object]) -> pa.Schema:
-    def number(name: str, unit: str, text: str) -> pa.Field:
-        return pa.field(name, pa.float64(), metadata={"unit": unit, "description": text})
-
-    return pa.schema(
-        [
-            pa.field("run", pa.int64(), nullable=False),
-            *(number(name, unit, "varied") for name, unit in zip(names, units)),
-            *(number(name, metric.unit, metric.text) for name, metric in METRICS.items()),
-            number("end_time", "s", "time of the last communication point that was reached"),
-            pa.field("outcome", pa.string(), nullable=False),
-            pa.field("message", pa.string()),
-        ],
-        metadata={KEY: json.dumps(provenance)},
-    )
-
-
-def _files(path: Path) -> list[Path]:
-    """Return the file of the whole table, or the parts if there is none."""
-    if (path / WHOLE).exists():
-        return [path / WHOLE]
-    return sorted(filter(_is_part, path.iterdir()))
-
-
-def _named(path: Path) -> Path:
-    """Name the path in errors of pyarrow."""
-    try:
-        path.as_posix().encode()
-    except UnicodeEncodeError as error:
-        raise SweepError(f"'{path}' is not UTF-8 text, which the name of a sweep must be") from error
-    return path
-
-
-def _is_part(file: Path) -> bool:
-    return PART.fullmatch(file.name) is not None
-
-
-def _read(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
-    """Yield each file with its table."""
-    room = MAX_SWEEP
-    for file in files:
-        try:
-            check_file(_named(file), MAX_SWEEP)
-            schema = pq.read_schema(file)
-            runs = _check_schema(file, schema)
-            with pq.ParquetFile(file, read_dictionary=TEXTS) as stored:
-                _check_size(file, stored.metadata, runs, room)
-                with memory_for(3 * MAX_SWEEP):  # a page may have more than the file states
-                    table = stored.read(use_threads=False)
-            room -= table.nbytes + sum(_expanded(table.column(name)) for name in TEXTS)
-            if room < 0:
-                raise _damaged(file)
-            _check_values(file, table, runs)
-            yield file, table.cast(schema)
-        except MemoryError:
-            raise _damaged(file) from None
-        except (OSError, pa.ArrowException) as error:
-            reason = " ".join(str(error).split())
-            raise SweepError(f"cannot read '{file}': {reason:.300}") from error
-
-
-def _check_schema(file: Path, schema: pa.Schema) -> int:
-    """Refuse a table without a sweep's columns; return the number of runs of its design."""
-    design = _provenance(file, schema)["design"]
-    names = [*design["grids"], *design["ranges"]]
-    runs: int = prod(map(len, design["grids"].values())) * design["draws"]
-    if runs > MAX_RUNS or not schema.equals(_schema(names, names, {})):
-        raise _damaged(file)
-    return runs
-
-
-def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> None:
-    """Refuse a table whose stated size exceeds the limit, before reading it."""
-    groups = [content.row_group(i) for i in range(content.num_row_groups)]
-    size = sum(g.column(j).total_uncompressed_size for g in groups for j in range(g.num_columns))
-    if size > room or sum(group.num_rows for group in groups) > runs:
-        raise _damaged(file)
-
-
-def _expanded(texts: pa.ChunkedArray) -> int:
-    """Return the bytes that dictionary-encoded texts would have if each row stored its own copy."""
-    lengths = (pc.binary_length(chunk.dictionary).take(chunk.indices) for chunk in texts.chunks)
-    return sum(pc.sum(of, min_count=0).as_py() for of in lengths)
-
-
-def _check_values(file: Path, table: pa.Table, count: int) -> None:
-    """Refuse runs and values outside the design, and invalid numbers."""
-    runs, grids = table.column("run"), _provenance(file, table.schema)["design"]["grids"]
-    numbers = [column for column in table.columns if pa.types.is_float64(column.type)]
-    if len(table) and not (
-        len(runs.unique()) == len(runs)
-        and 0 <= pc.min(runs).as_py() <= pc.max(runs).as_py() < count
-        and all(pc.all(pc.less(pc.abs(column), MAX_NUMBER), min_count=0).as_py() for column in numbers)
-        and all(pc.all(pc.is_in(table.column(n), pa.array(grids[n], pa.float64()))).as_py() for n in grids)  # of a map
-    ):
-        raise _damaged(file)
-
-
-def _damaged(file: Path) -> SweepError:
-    return SweepError(f"cannot read '{file}': it is damaged")
-
-
-def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
-    try:
-        text = (schema.metadata or {})[KEY]
-        provenance: dict[str, Any] = parsed(text) if len(text) <= MAX_PROVENANCE else {}
-        if not fits(provenance, SHAPE):
-            raise ValueError
-        design = provenance["design"]
-        varied, settings = len(design["grids"]) + len(design["ranges"]), len(provenance["options"]["settings"])
-        if varied > MAX_VARIED or settings > MAX_SETTINGS:
-            raise SweepError(f"'{file}' has more than {MAX_VARIED} varied variables or {MAX_SETTINGS} settings")
-    except (KeyError, ValueError, RecursionError):
-        raise SweepError(f"'{file}' was not written by twodof") from None
-    return provenance
-
-
 def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
-    wanted = json.loads(json.dumps(wanted))
+    wanted = parsed(json.dumps(wanted).encode())
     for key in COMPARED:
         if there[key] != wanted[key]:
             other = {
