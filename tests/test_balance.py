@@ -65,6 +65,7 @@ FIRST = [
     ("joint", {**AWAY, "a_des": (20.0, 0.0), "payload": 0.3}, 5.0, "the payload of 0.3 kg"),
     ("task", {"q_min": (-0.2, -3.0), "payload": 0.002}, 5.0, "'joint1' stood at its lower limit"),
     ("task", {"Kp": 5.0, "damping": 0.05}, 5.0, "still approaches"),
+    ("task", {"tau_ext": (0.0, 0.3)}, 5.0, "does not know tau_ext = (0, 0.3)"),
     ("task", {"Kp": (0.0, 50.0), "control_period": 0.06}, 5.0, "unstable"),
     ("joint", {**AWAY, **COARSE, "tau_ext": (0.03, 0.0)}, 5.0, "q_resolution"),
     ("task", {"x_des": (0.297, 0.07), "Kp": 5.0}, 5.0, "still approaches"),

@@ -30,13 +30,15 @@ export function byParts(found, parts, order, { reach, passed }) {
   const most = ({ kind, subject }) => {
     const own = weight(kind, subject, parts);
     if (kind === "reach") return reach;
+    if (kind === "load" && own <= -LASTING && bounds >= LASTING) return bounds + LASTING; // it has brought the arm to a limit
     if (["unstable", "sampling"].includes(kind)) return Math.max(own, ...FOLLOWING.map((each) => weight(each, "", parts)));
     if (kind === "singularity" && reach > SMALL) return Math.min(own, reach);
     return kind !== "limit" || reach <= SMALL ? own : bounds - reach > EXPLAINED ? Math.min(own, bounds - reach) : 0;
   };
   const ranked = found.flatMap((cause) => {
     const { kind, joint } = cause, all = most(cause), own = OF_JOINTS.includes(kind) ? parts.get(`${kind} ${joint}`) ?? 0 : all;
-    const first = kind === "degrees" || (kind === "unstable" && cause.share * passed > GROWN), opposed = FOLLOWING.includes(kind) && all < SMALL && Math.abs(own) >= SMALL;
+    const first = kind === "degrees" || (kind === "unstable" && cause.share * passed > GROWN), reduces = all <= -SMALL && !MOVING.includes(kind);
+    const opposed = reduces || (FOLLOWING.includes(kind) && all < SMALL && Math.abs(own) >= SMALL);
     const counts = first || MOTION.includes(kind) || opposed || (all >= SMALL && Math.abs(own) >= SMALL);
     if (!counts || (kind === "time" && all < LASTING)) return [];
     cause.noted = opposed || MOTION.includes(kind);

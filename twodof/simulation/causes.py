@@ -79,6 +79,8 @@ def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, st
         if cause.kind == "reach":
             return cause.part or 0.0
         own = _weight(cause.kind, cause.subject, parts)
+        if cause.kind == "load" and own <= -LASTING and bounds >= LASTING:
+            return bounds + LASTING  # it acts away from a limit now, and has brought the arm there
         if cause.kind in ("unstable", "sampling"):
             return max(own, *(_weight(kind, "", parts) for kind in FOLLOWING))
         if cause.kind == "singularity" and beyond > SMALL:
@@ -93,7 +95,8 @@ def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, st
         grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
         first, most = grows or cause.kind in ("diverged", "degrees"), weight(cause)
         own = parts.get((cause.kind, cause.joint), most) if cause.joint else most
-        opposed = cause.kind in FOLLOWING and most < SMALL and abs(own) >= SMALL
+        reduces = most <= -SMALL and cause.kind not in MOVING
+        opposed = reduces or (cause.kind in FOLLOWING and most < SMALL and abs(own) >= SMALL)
         if first or cause.kind in MOTION or opposed or (most >= SMALL and abs(own) >= SMALL):
             after = inf if cause.kind in MOTION or opposed else -round(most, 1)
             part = None if cause.kind in MOTION or first else most
@@ -268,7 +271,8 @@ def _friction(judge: Judge, missed: Sequence[str], parts: Mapping[tuple[str, str
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             creeps = not held and v[i] > CREEPING * judge.speed[i]
             stops = "slows it down" if creeps else "stops it short of its target"
-            text = f"{size} {f'holds it from {moved:.4g} s on' if held else stops}{'; raise Kp' * bool(judge.aims)}"
+            text = f"{size} {f'holds it from {moved:.4g} s on' if held else stops}"
+            text += "; raise Kp" * (bool(judge.aims) and (not parts or _weight("friction", "", parts) > 0.0))
             share = 1.0 - moved / judge.duration if held else 0.0
             state = "creeps" if creeps else "sticks"
             yield Cause("friction", f"joint '{joint}' {state}: {text}", share, joint, moved if held else None)

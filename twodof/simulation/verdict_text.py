@@ -68,13 +68,16 @@ def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
             names = "all other joints" if len(joints) == count - 1 > 1 else names
             grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
     several = len([cause for cause in grouped if not cause.noted]) > 1
-    return [cause._replace(text=cause.text + _part(cause) * several) for cause in grouped]
+    return [cause._replace(text=_with_part(cause)) for cause in grouped] if several else grouped
 
 
-def _part(cause: Cause) -> str:
-    """Return the part of a cause in the error in words, if it is known and less than all of it."""
-    measured = cause.part is not None and cause.kind != "reach" and SMALL <= cause.part < WHOLE
-    return f" ({100.0 * (cause.part or 0.0):.2g} % of the error)" if measured else ""
+def _with_part(cause: Cause) -> str:
+    """Return a cause's text, before its remedy with its part in the error, if that is known and less than all of it."""
+    if cause.part is None or cause.kind == "reach" or not SMALL <= abs(cause.part) < WHOLE:
+        return cause.text
+    percent, (text, *remedy) = f"{100.0 * abs(cause.part):.2g} %", cause.text.split("; ", 1)
+    part = f"{percent} of the error" if cause.part > 0.0 else f"it reduces the error by {percent}"
+    return "; ".join([f"{text} ({part})", *remedy])
 
 
 def _settings(judge: Judge) -> str:
