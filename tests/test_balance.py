@@ -13,9 +13,11 @@ from page_causes import page_causes
 from pytest import approx
 
 import twodof
+from twodof.geometry.dynamics import Dynamics
 from twodof.plant.mechanism import Mechanism
 from twodof.plant.robot import load_robot
-from twodof.simulation.balance import parts_of_error
+from twodof.plant.urdf import read_urdf
+from twodof.simulation.balance import UNKNOWN, parts_of_error
 
 AWAY: dict[str, Any] = {"q_des": (0.9, 0.8)}
 COARSE = {"control_period": 0.001, "q_resolution": (0.05, 0.05), "v_from_q": True}
@@ -39,8 +41,9 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> list[dict[tuple[str, str], float]]
     found: list[Any] = []
 
     def spy(*arguments: Any) -> Any:
-        found.append(parts_of_error(*arguments))
-        return found[-1]
+        made = parts_of_error(*arguments)
+        found.append(made.of)
+        return made
 
     monkeypatch.setattr("twodof.simulation.balance.parts_of_error", spy)
     return found
@@ -59,13 +62,19 @@ FIRST = [
     ("task", {"friction": (0.5, 0.0), "payload": 1e-4}, 5.0, "friction of 0.5 N·m"),
     ("task", {"f_ext": (0.0, 0.0, 10.0), "q_min": (-0.2, -3.0)}, 5.0, "'joint1' stood at its lower limit"),
     ("joint", {**AWAY, "Kp": 50.0, "Kd": 7.07}, 0.4, "has not settled: with these gains"),
-    ("task", {"Kp": 20.0, "Kd": 2.0, "payload": 0.001}, 0.5, "has not settled: with these gains"),
+    ("task", {"Kp": 20.0, "Kd": 2.0, "payload": 0.001}, 0.5, "has not settled"),
     ("joint", {**AWAY, "friction": (0.01, 0.005), "payload": 0.3}, 5.0, "the payload of 0.3 kg"),
     ("joint", {**AWAY, "friction": (0.05, 0.02), "payload": 0.002}, 5.0, "friction of 0.0"),
     ("joint", {**AWAY, "a_des": (20.0, 0.0), "payload": 0.3}, 5.0, "the payload of 0.3 kg"),
     ("task", {"q_min": (-0.2, -3.0), "payload": 0.002}, 5.0, "'joint1' stood at its lower limit"),
     ("task", {"Kp": 5.0, "damping": 0.05}, 5.0, "still approaches"),
     ("task", {"tau_ext": (0.0, 0.3)}, 5.0, "does not know tau_ext = (0, 0.3)"),
+    ("joint", {**AWAY, "q_max": (0.6, 3.0), "tau_ext": (0.2, 0.0)}, 5.0, "'joint1' stood at its upper limit 0.6"),
+    ("joint", {**AWAY, "Kp": 0.0, "Kd": 50.0, "control_period": 0.02}, 5.0, "Kp = 0: the controller"),
+    ("joint", {**AWAY, "q_max": (3.0, 0.7848), "control_period": 0.01, "q_resolution": 0.0186}, 5.0, "out of reach by"),
+    ("task", {"x_des": (0.368, 0.05), "Kp": 1.29, "Kd": 20.0}, 5.0, "and other causes keep an error"),
+    ("joint", {**AWAY, "f_ext": (0.0, -0.03, 0.0)}, 2.0, "and other causes keep an error"),
+    ("task", {"Kp": (2.0, 50.0)}, 1.5, "with a time constant of 20 s"),
     ("task", {"Kp": (0.0, 50.0), "control_period": 0.06}, 5.0, "unstable"),
     ("joint", {**AWAY, **COARSE, "tau_ext": (0.03, 0.0)}, 5.0, "q_resolution"),
     ("task", {"x_des": (0.297, 0.07), "Kp": 5.0}, 5.0, "still approaches"),
@@ -120,7 +129,7 @@ def test_small_causes_are_not_named_and_others_with_their_parts() -> None:
 
 
 def test_a_run_of_unknown_forces_has_its_causes_by_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twodof.simulation.balance.parts_of_error", lambda *_: {})
+    monkeypatch.setattr("twodof.simulation.balance.parts_of_error", lambda *_: UNKNOWN)
     found = verdict("joint", **AWAY, payload=0.3).causes
     assert [cause.kind for cause in found] == ["load"] and found[0].part is None
 
@@ -145,6 +154,24 @@ def test_an_input_that_changed_late_is_named(recovered: bool, tmp_path: Path) ->
         run = twodof.read_bag(tmp_path / "bag")
         made = run._judged(run.setup, run.x, run.target if run.x.size else run.x)
     assert "tau_ext[1] changed from 1 to 0 at 4.8 s" in made.lines[0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "rows", "words"),
+    [
+        ({"Kp": 5.0}, [(4.9, {"v_des[1]": 1e-4})], "still approach, with a time constant of 7.97 s"),
+        ({}, [(0.01 * k, {"tau_ext[1]": 0.3 * np.sin(0.06 * k)}) for k in range(1, 500)], "does not know tau_ext"),
+        ({"Kp": 0.0}, [(4.8, {"Kp[1]": 50.0, "Kp[2]": 50.0})], "Kp[1] changed from 0 to 50 at 4.8 s"),
+    ],
+)
+def test_a_late_change_is_a_cause_only_if_it_ended_one(settings: Any, rows: Any, words: str) -> None:
+    made = twodof.simulate(fmu_of("arm", "joint"), settings={**LARGE_STEPS, **AWAY, **settings}, changes=rows).verdict
+    assert words in made.lines[0]
+
+
+def test_a_direction_without_a_gain_shares_its_error_with_the_force_that_moves_it() -> None:
+    lines = verdict("joint", **AWAY, Kp=0.0, f_ext=(0.0, -0.93, 0.0)).lines
+    assert "does not know f_ext" in lines[0] and lines[1].startswith("also Kp = 0")
 
 
 def test_a_gain_that_changed_is_the_present_one_in_a_bag_without_a_verdict(tmp_path: Path) -> None:
@@ -191,3 +218,23 @@ def test_a_page_names_the_same_first_cause(control: str, settings: dict[str, Any
     made = twodof.simulate(fmu_of("arm", control), kept, settings={**LARGE_STEPS, **settings}).verdict
     found = page_causes(kept.run, kept.samples)
     assert made.causes[0].kind in ("time", found[0]["kind"] if found else "")
+
+
+@pytest.mark.parametrize("robot", ["arm", "panda", "so100", "kinova"])
+def test_the_dynamics_of_the_verdict_are_those_of_pinocchio(robot: str) -> None:
+    fmu = twodof.load_fmu(fmu_of(robot, "joint"))
+    assert fmu.urdf is not None
+    model = load_robot(fmu.urdf, fmu.frame, "xyz")
+    n = len(model.joints)
+    constants = ((1.0, 2.0, -9.0), 0.7, (0.02, 0.05, -0.03), [0.02] * n)
+    real, made = Mechanism(model, *constants), Dynamics(read_urdf(fmu.urdf), model.joints, fmu.frame, *constants)
+    for q, v, a in np.random.default_rng(2).uniform(-1.0, 1.0, (5, 3, n)):
+        np.testing.assert_allclose(
+            made.inverse_dynamics(q, v, a), real.inverse_dynamics(q, v, a), rtol=1e-9, atol=1e-11
+        )
+        np.testing.assert_allclose(made.mass_matrix(q), real.mass_matrix(q), rtol=1e-9, atol=1e-11)
+        seen, (x, jacobian, drift) = made.observe(q, v), real.observe(q, v)
+        np.testing.assert_allclose(seen.position, x, atol=1e-12)
+        np.testing.assert_allclose(seen.rotation, real.rotation, atol=1e-12)
+        np.testing.assert_allclose(seen.jacobian, jacobian, atol=1e-12)
+        np.testing.assert_allclose(seen.drift, drift, rtol=1e-9, atol=1e-11)

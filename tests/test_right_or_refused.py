@@ -6,6 +6,7 @@ a tight tolerance, between events with fixed joints at limits and a fixed rank o
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from native_models import Engine, damped_arm, engine, from_urdf, model, shipped
 from scipy.integrate import solve_ivp
 
+import twodof
 from twodof.plant import regime
 from twodof.plant.plant import Plant
 
@@ -419,3 +421,16 @@ def test_many_joints_at_stops_need_few_evaluations(name, friction, monkeypatch):
     plant.initialise()
     for _ in range(30):
         plant.step(STEP)
+
+
+def test_a_stop_is_released_where_its_effort_is_a_rounding_error(tmp_path: Path) -> None:
+    """A saturated motor releases joint2 at 0.52 s, where the reaction of the stop is a difference of large efforts."""
+    fmu = twodof.build_fmu(tmp_path / "arm.fmu", twodof.FmuOptions(native=True, control="joint"))
+    settings = {"q_des": (0.9, 0.8), "q_max": (3.0, 0.78), "limit_effort": True, "payload": 6.0, "payload_known": True}
+    runs = [
+        [sample.q for sample in twodof.samples(fmu, step=h, stop_time=1.0, settings=settings)][:: round(0.02 / h)]
+        for h in (0.001, 0.01, 0.02)
+    ]
+    assert min(q[1] for q in runs[0]) < 0.7 and max(q[1] for q in runs[0]) == 0.78
+    np.testing.assert_allclose(runs[1], runs[0], atol=1e-12)
+    np.testing.assert_allclose(runs[2], runs[0], atol=1e-12)

@@ -65,6 +65,13 @@ MIMIC = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
 <mimic joint="j" multiplier="{factor}" offset="0.1"/></joint></robot>"""
 
 
+@pytest.mark.parametrize("control", ["task", "joint", "effort"])
+def test_a_joint_of_the_shipped_arm_is_locked(control: str, tmp_path: Path) -> None:
+    options = twodof.FmuOptions(native=True, control=control, lock={"joint1": 0.3})
+    summary = twodof.simulate(twodof.build_fmu(tmp_path / "one.fmu", options), stop_time=0.1)
+    assert len(summary.last.q) == 1 and (control == "effort" or summary.last.q[0] == 0.35)
+
+
 def test_the_mimic_of_a_locked_joint_is_locked_at_the_matching_position() -> None:
     joints = read_urdf(lock_joints(MIMIC.format(factor=0.5), {"j": 0.4})).joints
     assert {joint.type for joint in joints.values()} == {"fixed"}

@@ -230,8 +230,9 @@ static double first_release(Step *step, double before)
     if (!doubt)
         return HUGE_VAL;
     const double instant = TIME_RESOLUTION * step->size;
-    if (release_margin(step, instant, 0) < 0.0)
-        return instant; /* a release by rounding */
+    const double at_once = release_margin(step, instant, 0);
+    if (at_once < 0.0 && at_once < -fabs(release_margin(step, 0.0, 0) - least_grip(step, step->effort[0])))
+        return instant; /* beyond the difference of two ways to compute the efforts; else the joint would be held again */
     memcpy(effort[0], step->effort[0], sizeof *effort);
     memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
     for (int k = 1; k < LOOKS; k++)

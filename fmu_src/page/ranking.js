@@ -25,13 +25,14 @@ export function weight(kind, subject, parts) {
  */
 /** @type {(found: Cause[], parts: Map<string, number>, order: string[], of: {reach: number, passed: number}) => Cause[]} */
 export function byParts(found, parts, order, { reach, passed }) {
-  const bounds = weight("limit", "", parts) + weight("singularity", "", parts);
+  const limits = weight("limit", "", parts), bounds = limits + weight("singularity", "", parts);
+  const net = bounds + Math.min(0, parts.get("sampling ") ?? 0), left = reach > SMALL ? net - reach : bounds; // a stop also balances wrong efforts
   /** @type {(cause: Cause) => number} */
   const most = ({ kind, subject }) => {
     const own = weight(kind, subject, parts);
     if (kind === "reach") return reach;
-    if (kind === "load" && own <= -LASTING && bounds >= LASTING) return bounds + LASTING; // it has brought the arm to a limit
-    if (["unstable", "sampling"].includes(kind)) return Math.max(own, ...FOLLOWING.map((each) => weight(each, "", parts)));
+    if (kind === "load" && own <= -LASTING && bounds >= LASTING && Math.abs(limits + own) < LASTING) return bounds + LASTING; // it has brought the arm to a limit
+    if (["unstable", "sampling"].includes(kind)) return Math.max(own, left > EXPLAINED ? left : 0, weight("saturation", "", parts));
     if (kind === "singularity" && reach > SMALL) return Math.min(own, reach);
     return kind !== "limit" || reach <= SMALL ? own : bounds - reach > EXPLAINED ? Math.min(own, bounds - reach) : 0;
   };

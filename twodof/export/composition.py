@@ -135,6 +135,9 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in zip(robot.q_min, robot.q_max, strict=True)
     )
     starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": rest}
+    if shipped and options.lock:  # the shipped arm's target may then be out of reach
+        q = dict(zip(("joint1", "joint2"), DEFAULT_ARM["q_start"]))
+        starts = {"gravity": DEFAULT_ARM["gravity"], "q_start": tuple(map(q.__getitem__, robot.joints))}
     settings = _settings(options, dict(zip(robot.joints, starts["q_start"])))
     if shipped and axes != "xy":
         raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")

@@ -98,7 +98,7 @@ class Kinematics:
             return self._columns[joint.name], 1.0, 0.0
         return self._columns.get(joint.leader), joint.ratio, joint.offset
 
-    def _in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
+    def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
         """Return the transforms of a joint's child in its parent."""
         origin, along = self.origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
@@ -132,7 +132,7 @@ class Kinematics:
         n = len(np.asarray(q))
         transforms = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
         for joint in chain:
-            transforms.append(transforms[-1] * self._in_parent(joint, q))
+            transforms.append(transforms[-1] * self.in_parent(joint, q))
         return transforms
 
     def path(self, link: str, q: ArrayLike) -> Array:

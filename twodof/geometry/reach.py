@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from .kinematics import Array, Kinematics
 
-SCATTERED, IMPROVED = 2000, 6
-"""Number of compared starts, and of the best of them, from which the problem is solved."""
+SCATTERED, IMPROVED = 2000, 6  # starts, and those of them that are improved
+MOST_STEPS = 100  # of each start; robots of many joints converge slowly to poses out of reach
 LONGEST = 10.0  # m: range of starts for a prismatic joint without limits
 EXACT = 1e-9  # m, rad: a solution within this distance of the target ends the search
 
@@ -84,7 +84,8 @@ def nearest(
     margin = 1e-12 * (1 + np.where(np.isfinite(width), width, 0))  # the solver must start inside the limits
     for start in [q, *starts[np.argsort(far)[:IMPROVED]]]:
         inside = np.clip(start, low + margin, high - margin)
-        found.append(least_squares(residual, inside, slope, (low, high), xtol=1e-13, ftol=1e-13, gtol=1e-13))
+        precise = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13)
+        found.append(least_squares(residual, inside, slope, (low, high), max_nfev=MOST_STEPS, **precise))
         if found[-1].cost < 0.5 * EXACT**2:
             break
     best = min(found, key=lambda each: each.cost)

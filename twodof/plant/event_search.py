@@ -222,8 +222,8 @@ def first_release(
         return min(grips(passed))
 
     instant = TIME_RESOLUTION * step
-    if margin(instant) < 0.0:
-        return instant  # a release by rounding
+    if (at_once := margin(instant)) < 0.0 and at_once < -abs(margin(0.0) - min(at_ends[0])):
+        return instant  # beyond the difference of two ways to compute the efforts; else the joint would be held again
     inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
     margins = [at_ends[0], *inner, at_ends[1]]
     looks = [x * step for i in doubtful for x in _doubtful_minima([m[i] for m in margins])]

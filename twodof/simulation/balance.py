@@ -14,18 +14,14 @@ Under joint control J is the identity and J̇ is 0. The part of a term c in the 
 Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 8.5.2 and 8.6.2.
 """
 
-import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..plant.mechanism import Mechanism
-from ..plant.orientation import rotation_error
-from ..plant.robot import Robot, load_robot
-from ..plant.urdf import RobotError
+from ..geometry.dynamics import Dynamics, rotation_error
 from ..plant.variables import EXACT
 from .controller_causes import PERIODS, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
@@ -44,24 +40,34 @@ Key = tuple[str, str]
 """A kind of cause, or "motion", and the joint or the input concerned, or ""."""
 
 
-def parts_of_error(judge: Judge, missed: Sequence[str]) -> Mapping[Key, float]:
-    """Return the part that each cause has in the errors of the missed outputs late in the run, the mean of the outputs.
+class Parts(NamedTuple):
+    """Parts of the errors of the missed outputs late in a run.
 
-    The result is empty if the equations of the robot are unknown, or if more than CLOSED remains without a cause.
+    Attributes:
+        of: part of each cause, the mean of the outputs; empty if the equations of the robot are unknown, or if more
+            than CLOSED remains without a cause.
+        static: magnitude of the error that would remain without the motion, by output, m or rad.
     """
+
+    of: Mapping[Key, float]
+    static: Mapping[str, float]
+
+
+UNKNOWN = Parts({}, {})
+
+
+def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
+    """Return the part that each cause has in the errors of the missed outputs late in the run."""
     setup, gravity = judge.setup, judge.given("gravity")
     if not missed or setup.robot is None or len(judge.end("tau")) != len(setup.joints) or len(gravity) != 3:
-        return {}
-    try:
-        text = ET.tostring(setup.robot.tree, encoding="unicode")
-        robot = load_robot(text, setup.frame, setup.axes or "xyz")
-    except RobotError:
-        return {}
-    if robot.joints != setup.joints or any(not len(judge.given(LAWS[name][0])) for name in judge.aims):
-        return {}
-    models = _models(judge, robot)
+        return UNKNOWN
+    known = setup.frame in setup.robot.links and {*setup.joints} <= setup.robot.joints.keys()
+    if not known or any(not len(judge.given(LAWS[name][0])) for name in judge.aims):
+        return UNKNOWN
+    models = _models(judge)
     owner = [name for name in judge.aims for _ in judge.given(LAWS[name][0])]
     rows = {name: np.array([of == name for of in owner]) for name in missed}
+    static = dict[str, float]()
     wholes, parts = dict.fromkeys(missed, 0.0), {name: defaultdict[Key, float](float) for name in missed}
     for sample in _late(judge):
         balance = _Balance(judge, models, *sample)
@@ -70,16 +76,18 @@ def parts_of_error(judge: Judge, missed: Sequence[str]) -> Mapping[Key, float]:
             wholes[name] += float(balance.e[own] @ balance.e[own])
             for key, term in terms:
                 parts[name][key] += float(term[own] @ balance.e[own])
+            still = [term[own] for (kind, _), term in terms if kind != "motion"]
+            static[name] = float(np.linalg.norm(sum(still))) if not static.get(name) else static[name]
     if not all(wholes.values()):
-        return {}
+        return UNKNOWN
     mean = defaultdict[Key, float](float)
     for name, own_parts in parts.items():
         for key, part in own_parts.items():
             mean[key] += part / wholes[name] / len(missed)
-    return mean if abs(1.0 - sum(mean.values())) <= CLOSED else {}
+    return Parts(mean, static) if abs(1.0 - sum(mean.values())) <= CLOSED else UNKNOWN
 
 
-def _models(judge: Judge, robot: Robot) -> dict[str, Mechanism]:
+def _models(judge: Judge) -> dict[str, Dynamics]:
     """Return the plant's model under "", and models in which each parameter after the other is the controller's."""
     own = controller_prefix(judge)
     payload, believed = payloads(judge)
@@ -87,13 +95,17 @@ def _models(judge: Judge, robot: Robot) -> dict[str, Mechanism]:
     values["payload"] = payload
     known = {name: judge.given(own + name) if own else values[name] for name in values}
     known["payload"] = believed
-    models = {}
+    models, made, urdf = {}, dict[str, Dynamics](), judge.setup.robot
+    assert urdf is not None
     for changed in ("", *PARAMETERS):
         if changed:
             values[changed] = known[changed]
-        models[changed] = Mechanism(
-            robot, values["gravity"], values["payload"], values["payload_com"], values["armature"]
-        )
+        key = str(values)
+        made[key] = made.get(key) or Dynamics(
+            urdf, judge.setup.joints, judge.setup.frame, values["gravity"], values["payload"], values["payload_com"],
+            values["armature"],
+        )  # fmt: skip
+        models[changed] = made[key]
     return models
 
 
@@ -114,17 +126,17 @@ class _Balance:
         e: errors of all outputs with a target, m and rad.
     """
 
-    def __init__(self, judge: Judge, models: Mapping[str, Mechanism], q: Array, v: Array, tau: Array) -> None:
+    def __init__(self, judge: Judge, models: Mapping[str, Dynamics], q: Array, v: Array, tau: Array) -> None:
         self._judge, self._models, self._known = judge, models, models[PARAMETERS[-1]]
         self._q, self._v, self._tau = q, v, tau
         known = self._known
-        x, rows, drift = (np.array(each) for each in known.observe(q, v))
+        x, rotation, rows, drift = known.observe(q, v)
         axes, errors, gains = [], [], []
         for name in judge.aims:
             axes += {"x": judge.setup.rows, "quat": [3, 4, 5]}.get(name, [])
             wanted = judge.wanted(name)
             errors.append(
-                rotation_error(wanted.tolist(), known.rotation)
+                rotation_error(wanted, rotation)
                 if name == "quat"
                 else wanted - (q if name == "q" else x[judge.setup.rows])
             )
@@ -140,7 +152,6 @@ class _Balance:
         judge, J, v, Kp, Kd = self._judge, self._J, self._v, self._Kp, self._Kd
         inverse = np.divide(1.0, Kp, out=np.zeros(len(Kp)), where=Kp > 0.0)
         a, reaction = self._motion()
-        yield ("gain", ""), np.where(Kp > 0.0, 0.0, self.e)
         rate, Kn = J @ v, float(judge.held.get("Kn", 0.0))
         yield ("motion", ""), inverse * (J @ a + self._drift + Kd * rate)
         yield from self._feedforward(inverse)
@@ -149,18 +160,34 @@ class _Balance:
         yield ("singularity", ""), inverse * (wanted - J @ (pseudo @ wanted))
         command = pseudo @ (wanted + Kn * rate) - Kn * v
         to_error = inverse[:, None] * (J @ np.linalg.inv(self._known.mass_matrix(self._q)))
-        for key, effort in chain(self._loads(a), self._reactions(reaction), self._shortages(command)):
-            yield key, to_error @ effort
+        efforts = [*chain(self._loads(a), self._reactions(reaction), self._shortages(command))]
+        free = Kp == 0.0
+        if not free.any():
+            yield from ((key, to_error @ effort) for key, effort in efforts)
+            return
+        # without a gain, the initial error stays, and forces share the rest of the error by their accelerations
+        first = np.concatenate([w if len(w := judge.aims[n].way) else self.e[self._own(n)] for n in judge.aims])
+        to_rate = J @ np.linalg.inv(self._known.mass_matrix(self._q))
+        rates = np.array([to_rate @ effort for _, effort in efforts])
+        whole, least = rates.sum(axis=0), 0.01 * np.abs(rates).sum(axis=0)  # forces in balance move nothing
+        share = np.divide(self.e - first, whole, out=np.zeros(len(Kp)), where=free & (np.abs(whole) > least))
+        yield ("gain", ""), np.where(free & (share != 0.0), first, np.where(free, self.e, 0.0))
+        for key, effort in efforts:
+            yield key, to_error @ effort + share * (to_rate @ effort)
+
+    def _own(self, name: str) -> slice:
+        """Return the rows of an output."""
+        sizes = [len(self._judge.given(LAWS[each][0])) for each in self._judge.aims]
+        first = sum(sizes[: [*self._judge.aims].index(name)])
+        return slice(first, first + len(self._judge.given(LAWS[name][0])))
 
     def _feedforward(self, inverse: Array) -> Iterator[tuple[Key, Array]]:
-        first = 0
         for name in self._judge.aims:
             _, _, velocity, acceleration = LAWS[name]
             own = np.zeros(len(self.e))
-            own[first : first + len(self._judge.given(velocity))] = 1.0
+            own[self._own(name)] = 1.0
             yield ("feedforward", velocity), -inverse * own * self._Kd * self._xd
             yield ("feedforward", acceleration), -inverse * own * self._xdd
-            first += len(self._judge.given(velocity))
 
     def _external(self) -> dict[str, Array]:
         given = self._judge.given
@@ -192,9 +219,9 @@ class _Balance:
 
     def _loads(self, a: Array) -> Iterator[tuple[Key, Array]]:
         """Yield efforts that the controller does not know, N·m or N."""
-        needed = {name: model.inverse_dynamics(self._q, self._v, a) for name, model in self._models.items()}
-        for before, name in pairwise(needed):
-            yield ("load", name), needed[before] - needed[name]
+        needed = {model: model.inverse_dynamics(self._q, self._v, a) for model in {*self._models.values()}}
+        for before, name in pairwise(self._models):
+            yield ("load", name), needed[self._models[before]] - needed[self._models[name]]
         for name, effort in self._external().items():
             yield ("load", name), -effort
 

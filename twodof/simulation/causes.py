@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..plant.urdf import Joint
-from ..plant.variables import EXACT
+from ..plant.variables import EXACT, GAINS
 from .aim import BAND
 from .cause import FLOOR, KINDS, SMALL, Cause, point_text
-from .controller_causes import damping, feedforward, gains, load, sampled, slow, unsettled
+from .controller_causes import damping, feedforward, gains, load, sampled
 from .judge import AT_LIMIT, Judge
+from .settling_causes import late_change, slow, unsettled
 
 MOST = 20  # causes in a verdict
 OFTEN = 0.05  # share of samples from which on a state is a cause
@@ -39,26 +40,46 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         missed: outputs that are not at their targets: "x", "quat" or "q".
         motion: motion at the end of the run.
     """
-    from .balance import parts_of_error  # Pinocchio takes a quarter of a second to import
+    from .balance import parts_of_error  # SciPy takes half a second to import
 
-    parts, rests = parts_of_error(judge, missed), not judge.moving
+    (parts, static), rests = parts_of_error(judge, missed), not judge.moving
     found = [*_degrees(judge, missed), *_beyond_limits(judge)]
     if missed:
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
         sticking = [*_friction(judge, missed, parts)]  # without parts, the rate of an error then tells nothing
-        found += [*sticking, *_singular(judge), *(slow(judge, missed) if rests and (parts or not sticking) else ())]
+        reach = max((cause.share for cause in found if cause.kind == "reach"), default=0.0)
+        static = {name: max(size, reach) for name, size in static.items()}
+        changed = [*late_change(judge)] if _explains(judge, missed) else []
+        approaching = slow(judge, missed, static) if rests and not changed and (parts or not sticking) else ()
+        found += [*sticking, *_singular(judge), *changed, *approaching]
     if missed or motion == "diverging" or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *sampled(judge)]
     if missed:
         found += damping(judge, ["x", "quat"] if motion in ("oscillating", "diverging") else missed)
     restless = max(_weight("time", "", parts), abs(parts.get(("sampling", ""), 0.0)))
     if restless > LASTING and not any(cause.kind in MOVING for cause in found):
-        found += unsettled(judge, missed)
+        found += unsettled(judge, parts.get(("motion", ""), 0.0), static)
     ranked = _by_parts(judge, found, parts) if parts else _by_kinds(judge, found)
     if not ranked:
         return ()
     root, *others = ranked[:MOST]
     return root._replace(noted=bool(missed) and root.kind in MOTION), *others  # a peak makes no error
+
+
+def _explains(judge: Judge, missed: Sequence[str]) -> bool:
+    """Return whether the inputs that changed last had most of the error before, or fell if efforts are unknown."""
+    if judge.latest is None or not missed:
+        return False
+    from .balance import parts_of_error  # as above
+
+    t, changes = judge.latest
+    groups = {name.partition("[")[0] for name, (old, new) in changes.items() if abs(new - old) >= LASTING * abs(old)}
+    parts = parts_of_error(judge.until(t), missed).of
+    if not parts:
+        return any(abs(new) < LASTING * abs(old) for old, new in changes.values())
+    kinds = {"friction": ("friction", ""), **dict.fromkeys(GAINS, ("gain", ""))}
+    each = [kinds.get(group, (kind, group)) for group in groups for kind in ("load", "feedforward")]
+    return any(_weight(kind, subject, parts) >= LASTING for kind, subject in each)
 
 
 def _weight(kind: str, subject: str, parts: Mapping[tuple[str, str], float]) -> float:
@@ -73,16 +94,19 @@ def _weight(kind: str, subject: str, parts: Mapping[tuple[str, str], float]) -> 
 def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, str], float]) -> list[Cause]:
     """Return the causes by their parts in the error, without those that are small; opposed forces are noted."""
     beyond = max((cause.part or 0.0 for cause in found if cause.kind == "reach"), default=0.0)
-    bounds = sum(_weight(kind, "", parts) for kind in ("limit", "singularity"))
+    limits = _weight("limit", "", parts)
+    bounds = limits + _weight("singularity", "", parts)
 
     def weight(cause: Cause) -> float:
         if cause.kind == "reach":
             return cause.part or 0.0
         own = _weight(cause.kind, cause.subject, parts)
-        if cause.kind == "load" and own <= -LASTING and bounds >= LASTING:
+        if cause.kind == "load" and own <= -LASTING and bounds >= LASTING and abs(limits + own) < LASTING:
             return bounds + LASTING  # it acts away from a limit now, and has brought the arm there
         if cause.kind in ("unstable", "sampling"):
-            return max(own, *(_weight(kind, "", parts) for kind in FOLLOWING))
+            net = bounds + min(0.0, parts.get(("sampling", ""), 0.0))  # a stop also balances wrong efforts
+            left = net - beyond if beyond > SMALL else bounds
+            return max(own, left if left > EXPLAINED else 0.0, _weight("saturation", "", parts))
         if cause.kind == "singularity" and beyond > SMALL:
             return min(own, beyond)
         led = beyond > SMALL and cause.kind == "limit"

@@ -1,14 +1,14 @@
 """Causes of a run's failure in the controller: its gains, its sampling, and what it does not know."""
 
 from collections.abc import Iterator, Sequence
-from math import inf, log, sqrt
+from math import log, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from .aim import BAND
 from .cause import FLOOR, Cause, point_text
-from .judge import AT_LIMIT, OF_THE_END, Judge
+from .judge import AT_LIMIT, Judge
 from .sampled_loop import quickest_gains, spectral_radius, stable_gains
 
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
@@ -16,7 +16,6 @@ SLIGHT = 1e-4  # torque, relative to the largest effort, below which a load does
 LEVER = 1.0  # m: of a force at the end effector
 PERIODS = ("control_period", "control_delay")
 WEAK = 0.2  # damping ratio below which damping is too small
-SWINGING = 0.7  # damping ratio below which an error that shrinks once will grow again
 FADING = 0.7  # ratio of mean speeds, of the second to the first half of the last samples, that shows a decay
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 GAINS = (("Kp", "Kd"), ("Kp_rot", "Kd_rot"))
@@ -153,7 +152,7 @@ def sampled(judge: Judge) -> Iterator[Cause]:
         gains = gains if judge.aims else "the gains of the controller outside"
         period = [f"{name} = {setup.starts[name]:g} s" for name in PERIODS if setup.starts.get(name)]
         what = " and ".join(period) or f"communication steps of {setup.step:g} s"
-        sensors = ", ".join(_sensors(judge, i))
+        sensors = ", ".join(sensors_of(judge, i))
         text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: "
         text += f"{sensors}: too much for {gains} at {what}" if sensors else f"{gains} are too high for {what}"
         yield Cause("sampling", text, float(turns[i]), setup.joints[i])
@@ -170,7 +169,7 @@ class _Loop(NamedTuple):
     Kd: float
 
 
-def _loops(judge: Judge, period: float, delay: float) -> Iterator[_Loop]:
+def loops(judge: Judge, period: float, delay: float) -> Iterator[_Loop]:
     """Yield the loops of a sampled controller; that of the self-motion has no Kp, and moves only redundant arms."""
     setup, differences = judge.setup, bool(judge.setup.starts.get("v_from_q"))
     redundant = len(setup.rows) + (3 if judge.wanted("quat").size else 0) < len(setup.joints)
@@ -187,7 +186,7 @@ def _fastest(judge: Judge, period: float, delay: float) -> str:
     if not period:
         stiff = next((group for group in ("Kp", "Kd") if judge.given(group).any()), "")
         return f" ({stiff} up to {judge.given(stiff).max():g})" if stiff else ""
-    loop = max(_loops(judge, period, delay), default=None)
+    loop = max(loops(judge, period, delay), default=None)
     return f" ({', '.join(_named(judge, loop))})" if loop is not None else ""
 
 
@@ -199,18 +198,18 @@ def _named(judge: Judge, loop: _Loop, units: Sequence[str] = ("", "")) -> list[s
 
 def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
     """Yield the worst loop of each kind that is unstable, even while limits hold the joints, or hardly decays."""
-    every = [*_loops(judge, period, delay)]
+    every = [*loops(judge, period, delay)]
     for group, output in (("Kp", "q" if "q" in judge.aims else "x"), ("Kp_rot", "quat"), ("", "")):
         loop = max((loop for loop in every if loop.stiff == group), default=None)
-        if loop is not None and loop.Kd < WEAK * 2.0 * sqrt(loop.Kp) and late_by(judge, _decay(loop)) > judge.duration:
+        if loop is not None and loop.Kd < WEAK * 2.0 * sqrt(loop.Kp) and late_by(judge, decay(loop)) > judge.duration:
             continue  # the loop lacks damping at any period
-        if loop is None or (judge.held.get("payload") and (_rests(judge) or _rate(judge, output) > 0.0)):
+        if loop is None or (judge.held.get("payload") and (_rests(judge) or rate_of(judge, output) > 0.0)):
             continue  # a load lowers the true gains
-        rate = -log(loop.radius) / period
+        rate = -log(max(loop.radius, 1e-300)) / period
         if loop.radius > UNSTABLE:
             state = f"the loop{'' if group else ' of the self-motion'} is unstable, "
             state += f"{'an error' if group else 'it'} doubles in {-log(2.0) / rate:.2g} s"
-        elif group and rate < SPOILT * _decay(loop) and log(1.0 / BAND) > rate * (judge.duration - judge.changed):
+        elif group and rate < SPOILT * decay(loop) and log(1.0 / BAND) > rate * (judge.duration - judge.changed):
             state = f"the loop is close to unstable, an error takes {log(1.0 / BAND) / max(rate, 1e-9):.2g} s to 2 %"
             state = state if rate > 1e-6 else "the loop is at its limit of stability, errors do not decay"
         else:
@@ -244,12 +243,12 @@ def _rests(judge: Judge) -> bool:
     return bool(inside and v.max(initial=0.0) <= STILL * max(float(judge.speed.max()), FLOOR))
 
 
-def _decay(loop: _Loop) -> float:
+def decay(loop: _Loop) -> float:
     """Return the slowest rate of decay of the loop of a continuous controller, 1/s."""
     return float(-np.roots([1.0, loop.Kd, loop.Kp]).real.max())
 
 
-def _sensors(judge: Judge, i: int) -> Iterator[str]:
+def sensors_of(judge: Judge, i: int) -> Iterator[str]:
     """Yield the settings of the sensors of joint i."""
     starts, unit = judge.setup.starts, judge.setup.units[i]
     period, coarse = starts.get("control_period", 0.0), starts.get(f"q_resolution[{i + 1}]", 0.0)
@@ -276,66 +275,12 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("damping", f"{text}: critical damping is {2.0 * sqrt(p):.4g} s⁻¹", 1.0 - ratio)
 
 
-def slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    """Yield a cause for each output whose error still shrinks, with the remaining time by its rate.
-
-    After a late change of an input, the rate is that of its consequences, and the change is the cause.
-    """
-    if (text := _late_change(judge)) and not judge.moving:
-        yield Cause("time", text, judge.duration)
-        return
-    for name in missed:
-        rate, aim = _rate(judge, name), judge.aims[name]
-        stiff, damp = ("Kp_rot", "Kd_rot") if name == "quat" else ("Kp", "Kd")
-        pairs = [(p, d) for p, d in zip(judge.given(stiff), judge.given(damp)) if p > 0.0]
-        ratios = [d / (2.0 * sqrt(p)) for p, d in pairs]
-        if min(ratios, default=1.0) < SWINGING:  # an error passes 0 and grows again
-            rate = min(rate, *(0.5 * d for _, d in pairs))
-        left = log(max(aim.last / max(BAND * aim.first, FLOOR), 1.0)) / rate if rate else 0.0
-        left += OF_THE_END * (judge.duration - judge.changed)  # the error must stay there
-        what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
-        if rate and left < 1000.0 * judge.duration:
-            late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
-            text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
-            remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > 1.0 else "raise the gains"
-            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; {remedy}, or stop later", left)
-
-
-def unsettled(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    """Yield the reason of an error that moves, and neither decays steadily nor lacks damping."""
-    rates = [_decay(loop) for loop in _loops(judge, 1.0, 0.0) if loop.Kp > 0.0 and loop.Kd > 0.0]
-    left, sensors = late_by(judge, min(rates, default=inf)), [*_sensors(judge, int(judge.speed.argmax()))]
-    settings = " and ".join(f"{name} = {judge.setup.starts[name]:g} s" for name in PERIODS if judge.held.get(name))
-    if left > 0.0:
-        text = f"the motion has not settled: with these gains it takes about {left:.3g} s more to 2 %"
-        yield Cause("time", f"{text}; raise the gains, or stop later", left)
-    elif sensors:
-        text = f"joint '{judge.setup.joints[int(judge.speed.argmax())]}' is measured with {', '.join(sensors)}"
-        yield Cause("sampling", f"{text}: the controller does not see smaller errors", 0.5)
-    elif settings:
-        text = f"the motion does not settle with {settings}: the efforts of the controller are too late"
-        yield Cause("sampling", f"{text}; reduce {'them' if ' and ' in settings else 'it'}", 0.5)
-
-
-def _late_change(judge: Judge) -> str:
-    """Return a change of an input, after which the time was too short for an error to decay, in words."""
-    rates = [_decay(loop) for loop in _loops(judge, 1.0, 0.0) if loop.Kp > 0.0 and loop.Kd > 0.0]
-    if judge.latest is None or judge.latest[0] <= judge.changed:
-        return ""
-    t, name, before, after = judge.latest
-    needed = log(1.0 / BAND) / min(rates, default=1e-9)
-    if judge.duration - t >= needed:
-        return ""
-    text = f"{name} changed from {before:.4g} to {after:.4g} at {t:.4g} s"
-    return f"{text}, and an error needs about {needed:.3g} s to decay to 2 %; stop later"
-
-
 def late_by(judge: Judge, rate: float) -> float:
     """Return by how much an error that decays with a rate, 1/s, needs more time to 2 % than it has, s."""
     return log(1.0 / BAND) / max(rate, 1e-9) - (judge.duration - judge.changed)
 
 
-def _rate(judge: Judge, name: str) -> float:
+def rate_of(judge: Judge, name: str) -> float:
     """Return the rate, 1/s, at which an output's error shrinks steadily at the end of the run; else 0."""
     if name not in judge.aims:
         return 0.0

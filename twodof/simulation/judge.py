@@ -6,8 +6,11 @@ axes or joints, h the communication step, and θ_k the angle between the end eff
 Nothing is interpolated: times and extremes are those of samples.
 """
 
+from __future__ import annotations
+
 import io
 from collections.abc import Mapping, Sequence
+from copy import copy
 from math import inf, nan, sqrt
 
 import numpy as np
@@ -38,7 +41,7 @@ class Judge:
     Attributes:
         count: samples so far.
         inputs: present values of changed inputs.
-        latest: last change of an input that is no target: time in s, name, and value before and after.
+        latest: last change of inputs that are no targets: time in s, and values before and after by name.
         aims: errors by output, for outputs with a target.
         targets: present targets by output, 1 × values.
         effort, speed: largest magnitude for each joint, n values; the following attributes also have n values.
@@ -52,7 +55,7 @@ class Judge:
     def __init__(self, setup: Setup, sizes: Sequence[int]) -> None:
         n = len(setup.joints)
         self.setup, self.inputs = setup, dict[str, float]()
-        self.latest: tuple[float, str, float, float] | None = None
+        self.latest: tuple[float, Mapping[str, tuple[float, float]]] | None = None
         self.count, self.changes, self.changed = 0, 0, -inf
         self.aims: dict[str, Aim] = {}
         self.effort, self.speed, self.chatter = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -88,10 +91,13 @@ class Judge:
 
     def note(self, t: float, inputs: Mapping[str, float]) -> None:
         """Note inputs that changed at a time, s, as the present ones; the last one that is no target as ``latest``."""
+        changed = {}
         for name in inputs.keys() - self._where.keys():
             before = self.inputs.get(name, self.setup.starts.get(name, inputs[name]))
             if before != inputs[name]:
-                self.latest = t, name, float(before), float(inputs[name])
+                changed[name] = float(before), float(inputs[name])
+        if changed:
+            self.latest = t, changed
         self.inputs |= inputs
 
     def flush(self) -> None:
@@ -222,6 +228,14 @@ class Judge:
             self._filled = end
 
     # --- results ---
+
+    def until(self, t: float) -> Judge:
+        """Return a judge of the samples before a time, s, at which the latest change of an input was made."""
+        earlier, changes = copy(self), self.latest[1] if self.latest else {}
+        earlier.inputs = {**self.inputs, **{name: before for name, (before, _) in changes.items()}}
+        earlier._filled = max(1, int(np.searchsorted(self.history(), t, side="right")))
+        earlier.last, earlier._time = earlier._kept[earlier._filled - 1, 1 + len(TARGETS) :], t
+        return earlier
 
     def _of(self, rows: Array, name: str) -> Array:
         i = OUTPUTS.index(name)

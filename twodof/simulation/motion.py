@@ -41,7 +41,10 @@ def ringing(t: Array, y: Array) -> Ringing | None:
     bend = y[2:] - 2.0 * y[1:-1] + y[:-2]
     residual = y[2:] - fitted @ (a, b, c)
     if np.linalg.norm(residual) <= LINEAR * np.linalg.norm(bend):
-        s = np.log(np.roots([1.0, -a, -b]).astype(complex)[0]) / h
+        root = complex(np.roots([1.0, -a, -b])[0])
+        if not root:
+            return None  # the motion ends within one sample
+        s = np.log(root) / h
         seen = swings(y - c / (1.0 - a - b)) if a + b != 1.0 else 0
         return Ringing(abs(s.imag) / (2 * pi), -s.real / abs(s)) if seen >= 2 and abs(s.imag) * h > 1e-9 else None
     return _by_crossings(t, y)

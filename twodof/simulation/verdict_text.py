@@ -14,7 +14,6 @@ WHOLE = 0.995  # part of an error that is printed as the whole
 MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
 RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
-UNITS = {"x": "m"}  # of errors, rad for the others
 ERRORS = {"x": "position", "quat": "orientation", "q": "joints"}
 SWITCHES = ("payload_known", "limit_effort")
 CONTROLLER = {
@@ -111,7 +110,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     """Return settling, overshoot, RMS error and motion in words."""
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
-        firsts = [f"{aim.first:.3g} {UNITS.get(name, 'rad')}" for name, aim in judge.aims.items()]
+        firsts = [f"{aim.first:.3g} {_unit(judge, name)}" for name, aim in judge.aims.items()]
         late = f"not within 2 % of the initial error of {' and '.join(firsts)}"
         moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
         only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
@@ -120,7 +119,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         if "overshoot" in numbers and (numbers["overshoot"] or outcome == "reached"):
             past = numbers["overshoot"]
             name, aim = next(iter(judge.aims.items()))
-            far = f"the target is passed by {past * aim.first:.3g} {UNITS.get(name, 'rad')}"
+            far = f"the target is passed by {past * aim.first:.3g} {_unit(judge, name)}"
             parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else far)
     elif outcome == "not reached":
         parts.append("the run starts at its target")
@@ -134,6 +133,12 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         rings = f" at {numbers['frequency']:.4g} Hz{grows}, damping ratio {numbers['damping']:.3g}"
     end = motion + rings if motion in ("oscillating", "diverging") else _rest(judge, outcome) or motion
     return ", ".join([*parts, f"{end} at the end"])
+
+
+def _unit(judge: Judge, name: str) -> str:
+    """Return the unit of an output's error; joints of both kinds have none."""
+    units = {*judge.setup.units} if name == "q" else {"m" if name == "x" else "rad"}
+    return units.pop() or "rad" if len(units) == 1 else "rad or m"
 
 
 def _rest(judge: Judge, outcome: str) -> str:
