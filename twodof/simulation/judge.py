@@ -92,7 +92,7 @@ class Judge:
     def note(self, t: float, inputs: Mapping[str, float]) -> None:
         """Note inputs that changed at a time, s, as the present ones; the last one that is no target as ``latest``."""
         changed = {}
-        for name in inputs.keys() - self._where.keys():
+        for name in (name for name in inputs if name not in self._where):
             before = self.inputs.get(name, self.setup.starts.get(name, inputs[name]))
             if before != inputs[name]:
                 changed[name] = float(before), float(inputs[name])
