@@ -124,7 +124,7 @@ def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one
     assert not any(file for folder in tmp_path.iterdir() if folder != keep for file in folder.iterdir())
 
 
-@pytest.mark.parametrize("name", [".", "../bag", "../../work/bag"])
+@pytest.mark.parametrize("name", [".", "../bag", "../../other/bag"])
 def test_a_bag_with_the_working_directory_in_it_is_not_overwritten(run, tmp_path, monkeypatch, name):
     path = tmp_path / "work" / "bag"
     written(run, path, 5)

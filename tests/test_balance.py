@@ -18,6 +18,8 @@ from twodof.plant.mechanism import Mechanism
 from twodof.plant.robot import load_robot
 from twodof.plant.urdf import read_urdf
 from twodof.simulation.balance import UNKNOWN, parts_of_error
+from twodof.simulation.setup import setup
+from twodof.simulation.verdict import judged
 
 AWAY: dict[str, Any] = {"q_des": (0.9, 0.8)}
 COARSE = {"control_period": 0.001, "q_resolution": (0.05, 0.05), "v_from_q": True}
@@ -69,7 +71,8 @@ FIRST = [
     ("task", {"q_min": (-0.2, -3.0), "payload": 0.002}, 5.0, "'joint1' stood at its lower limit"),
     ("task", {"Kp": 5.0, "damping": 0.05}, 5.0, "still approaches"),
     ("task", {"tau_ext": (0.0, 0.3)}, 5.0, "does not know tau_ext = (0, 0.3)"),
-    ("joint", {**AWAY, "q_max": (0.6, 3.0), "tau_ext": (0.2, 0.0)}, 5.0, "'joint1' stood at its upper limit 0.6"),
+    ("joint", {**AWAY, "q_max": (0.6, 3.0), "tau_ext": (0.2, 0.0)}, 5.0, "'joint1' is out of reach by 0.3 rad"),
+    ("task", {"x_des": (1.0, 0.05), "payload": 0.3}, 5.0, "the target is out of reach by"),
     ("joint", {**AWAY, "Kp": 0.0, "Kd": 50.0, "control_period": 0.02}, 5.0, "Kp = 0: the controller"),
     ("joint", {**AWAY, "q_max": (3.0, 0.7848), "control_period": 0.01, "q_resolution": 0.0186}, 5.0, "out of reach by"),
     ("task", {"x_des": (0.368, 0.05), "Kp": 1.29, "Kd": 20.0}, 5.0, "and other causes keep an error"),
@@ -120,6 +123,26 @@ def test_a_stuck_joint_has_the_part_that_the_controller_asks_of_it(parts: list[d
     made = verdict("joint", q_des=(0.5, 0.36), friction=(5.0, 5.0))
     assert parts[-1]["friction", "joint1"] + parts[-1]["friction", "joint2"] == approx(1.0, abs=1e-6)
     assert made.causes[0].part == approx(1.0, abs=1e-6)
+
+
+def test_a_cause_that_is_first_by_a_rule_has_no_part() -> None:
+    root = verdict("task", tau_ext=(0.0, 0.3)).causes[0]
+    assert (root.kind, root.part) == ("load", None)
+
+
+def test_friction_that_holds_two_joints_is_first_beside_a_load_that_it_balances() -> None:
+    """Without the friction of joint2 the arm reaches."""
+    made = verdict("joint", **AWAY, friction=(0.1, 0.05), tau_ext=(0.1, 0.0))
+    assert [cause.kind for cause in made.causes] == ["friction"] * len(made.causes)
+    assert verdict("joint", **AWAY, friction=(0.1, 0.0), tau_ext=(0.1, 0.0)).numbers["final_joint_error"] < 0.2
+
+
+def test_a_distance_that_overflows_is_not_reached() -> None:
+    target = {"x": np.full((9, 1), 1e200)}
+    t, q = np.arange(9.0), np.zeros((9, 1))
+    values = {"q": q, "v": q, "x": q, "tau": q[:, :0], "quat": q[:, :0]}
+    facts = setup(joints=("j",), robot=None, frame="", axes="x", step=1.0, starts={})
+    assert judged(facts, t, values, target).outcome == "not reached"
 
 
 def test_small_causes_are_not_named_and_others_with_their_parts() -> None:

@@ -78,9 +78,9 @@ export class Balance {
       terms.push([`feedforward ${law[3]}`, of(xd.map((value, i) => Kd[i] * value))], [`feedforward ${law[4]}`, of(xdd)]);
     }
     const needed = off(this.dynamics(q, v, a, payload).tau, this.dynamics(q, v, a, believed).tau);
-    for (const [key, effort] of [["load payload", needed], ...this.external(q, v).map(([name, own]) => [`load ${name}`, own.map((value) => -value)]),
-      ...this.reactions(q, reaction), ...this.shortages(tau, short)])
-      terms.push([String(key), scaled(along(solved(mass, /** @type {number[]} */ (effort))))]);
+    /** @type {[string, number[]][]} */
+    const loads = [["load payload", needed], ...this.external(q, v).map(([name, own]) => /** @type {[string, number[]]} */ ([`load ${name}`, own.map((value) => -value)]))];
+    for (const [key, effort] of [...netted(loads, this.reactions(q, reaction)), ...this.shortages(tau, short)]) terms.push([key, scaled(along(solved(mass, effort)))]);
     return { e, terms };
   }
 
@@ -192,6 +192,18 @@ export class Balance {
       return saturated || sampled ? [/** @type {[string, number[]]} */ ([saturated ? `saturation ${i}` : "sampling ", own])] : [];
     });
   }
+}
+
+/** Loads and reactions; the friction of a joint balances the loads at it before the controller. */
+/** @type {(loads: [string, number[]][], reactions: [string, number[]][]) => [string, number[]][]} */
+function netted(loads, reactions) {
+  const all = [...loads, ...reactions], isFriction = (/** @type {string} */ key) => key.startsWith("friction ");
+  const sums = [loads, reactions.filter(([key]) => isFriction(key))].map((some) => all[0][1].map((_, i) => some.reduce((sum, [, effort]) => sum + effort[i], 0)));
+  const held = sums[0].map((load, i) => (load * sums[1][i] < 0 ? Math.min(Math.abs(load), Math.abs(sums[1][i])) : 0));
+  return all.map(([key, effort]) => {
+    const side = key.startsWith("load ") ? 0 : isFriction(key) ? 1 : -1;
+    return [key, side < 0 ? effort : effort.map((value, i) => value * (held[i] ? 1 - held[i] / Math.abs(sums[side][i]) : 1))];
+  });
 }
 
 /** @type {(a: number[], b: number[]) => number} */

@@ -43,7 +43,7 @@ export function byParts(found, parts, order, { reach, passed }) {
     const counts = first || MOTION.includes(kind) || opposed || (all >= SMALL && Math.abs(own) >= SMALL);
     if (!counts || (kind === "time" && all < LASTING)) return [];
     cause.noted = opposed || MOTION.includes(kind);
-    return [{ cause, keys: [Number(!first), cause.noted ? Infinity : -Math.round(10 * all), order.indexOf(kind), -own, -cause.share] }];
+    return [{ cause, keys: [Number(!first), cause.noted ? Infinity : kind === "reach" && all >= LASTING ? -Infinity : -Math.round(10 * all), order.indexOf(kind), -own, -cause.share] }];
   });
   ranked.sort((a, b) => a.keys.reduce((sum, key, i) => sum || (key === b.keys[i] ? 0 : key - b.keys[i]), 0));
   return noted(ranked.map(({ cause }) => cause));

@@ -58,7 +58,7 @@ class Dynamics:
         self._bodies: dict[str, list[tuple[float, Array, Array]]] = {}
         for joint in self._tree:
             mass, com, inertia = self._kinematics.body(joint.child)
-            self._bodies[joint.child] = [(mass, np.array(com), np.array(inertia).reshape(3, 3))] if mass else []
+            self._bodies[joint.child] = [(mass, np.array(com), np.array(inertia).reshape(3, 3))]
         if payload and frame in self._bodies:
             self._bodies[frame].append((payload, np.asarray(offset), np.zeros((3, 3))))
 

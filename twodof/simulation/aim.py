@@ -27,6 +27,22 @@ class Aim:
         """Add N samples of the move."""
         if size.max() > BAND * self.first:
             self.outside = t[np.flatnonzero(size > BAND * self.first)[-1]]
-        if self.way.size and self.first >= SMALLEST_MOVE:
+        if self.way.size and SMALLEST_MOVE <= self.first < inf:
             self.past = max(self.past, -float((e @ self.way).min()) / self.first**2)
         self.last = float(size[-1])
+
+
+def errors(name: str, now: Array, target: Array) -> tuple[Array, Array]:
+    """Return the error vectors of N samples (empty for an angle) and their magnitudes."""
+    if name == "quat":
+        return np.empty((len(now), 0)), angles(now, target)
+    e = target - now
+    with np.errstate(over="ignore"):  # infinite from errors of 1e154 on
+        return e, np.sqrt((e * e).sum(axis=1))
+
+
+def angles(quat: Array, target: Array) -> Array:
+    """Return the angle of each unit quaternion from a target quaternion of any length but 0, rad."""
+    target = target / np.linalg.norm(target, axis=-1, keepdims=True)
+    apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
+    return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))

@@ -10,13 +10,13 @@ each force and one for the motion:
     e = Kp⁻¹ ((J q̈ + J̇ v + Kd J v) − Kd ẋ_des − ẍ_des + (I − J J⁺) (a − J̇ v)
               + J M⁻¹ (id(q̈) − id_known(q̈) − tau_ext − Jᵀ f_ext + D v − r + s))
 
-Under joint control J is the identity and J̇ is 0. The part of a term c in the error is c·e / e·e; all parts add up to 1.
+Friction first balances the loads at its joint. Under joint control J is the identity and J̇ is 0. The part of a term c in the error is c·e / e·e; all parts add up to 1.
 Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 8.5.2 and 8.6.2.
 """
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,7 +59,9 @@ UNKNOWN = Parts({}, {})
 def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
     """Return the part that each cause has in the errors of the missed outputs late in the run."""
     setup, gravity = judge.setup, judge.given("gravity")
-    if not missed or setup.robot is None or len(judge.end("tau")) != len(setup.joints) or len(gravity) != 3:
+    lawful = not judge.held.get("limit_effort") and not any(map(setup.starts.get, PERIODS))  # the effort is the law's
+    efforts = len(judge.end("tau")) == len(setup.joints) or lawful
+    if not missed or setup.robot is None or not efforts or len(gravity) != 3:
         return UNKNOWN
     known = setup.frame in setup.robot.links and {*setup.joints} <= setup.robot.joints.keys()
     if not known or any(not len(judge.given(LAWS[name][0])) for name in judge.aims):
@@ -151,16 +153,17 @@ class _Balance:
         """Yield the terms of e, m and rad, with their causes."""
         judge, J, v, Kp, Kd = self._judge, self._J, self._v, self._Kp, self._Kd
         inverse = np.divide(1.0, Kp, out=np.zeros(len(Kp)), where=Kp > 0.0)
-        a, reaction = self._motion()
         rate, Kn = J @ v, float(judge.held.get("Kn", 0.0))
-        yield ("motion", ""), inverse * (J @ a + self._drift + Kd * rate)
-        yield from self._feedforward(inverse)
         wanted = Kp * self.e + Kd * (self._xd - rate) + self._xdd - self._drift
         pseudo = np.linalg.pinv(J, float(judge.setup.starts.get("rcond", 0.0)))
+        command = self._known.inverse_dynamics(self._q, v, pseudo @ (wanted + Kn * rate) - Kn * v)
+        tau = self._tau if self._tau.size else command  # bags may have no efforts
+        a, reaction = self._motion(tau)
+        yield ("motion", ""), inverse * (J @ a + self._drift + Kd * rate)
+        yield from self._feedforward(inverse)
         yield ("singularity", ""), inverse * (wanted - J @ (pseudo @ wanted))
-        command = pseudo @ (wanted + Kn * rate) - Kn * v
         to_error = inverse[:, None] * (J @ np.linalg.inv(self._known.mass_matrix(self._q)))
-        efforts = [*chain(self._loads(a), self._reactions(reaction), self._shortages(command))]
+        efforts = [*self._netted(a, reaction), *self._shortages(command, tau)]
         free = Kp == 0.0
         if not free.any():
             yield from ((key, to_error @ effort) for key, effort in efforts)
@@ -194,7 +197,7 @@ class _Balance:
         forces = {"tau_ext": given("tau_ext"), "f_ext": self._force.T @ given("f_ext")}
         return {**forces, "damping": -given("damping") * self._v}
 
-    def _motion(self) -> tuple[Array, Array]:
+    def _motion(self, tau: Array) -> tuple[Array, Array]:
         """Return accelerations, rad/s² or m/s², and reactions of stops and friction, N·m or N.
 
         A joint at a stop, and one at rest with friction, does not accelerate, unless that needs a stop that pulls or
@@ -204,7 +207,7 @@ class _Balance:
         friction = self._judge.given("friction")
         low, high = (np.abs(self._q - bound) <= AT_LIMIT for bound in (setup.low, setup.high))
         M = real.mass_matrix(self._q)
-        effort = self._tau + sum(self._external().values()) - real.inverse_dynamics(self._q, v, np.zeros(len(v)))
+        effort = tau + sum(self._external().values()) - real.inverse_dynamics(self._q, v, np.zeros(len(v)))
         effort -= friction * np.sign(v)
         held = (v == 0.0) & (low | high | (friction > 0.0))
         for _ in setup.joints:
@@ -225,6 +228,16 @@ class _Balance:
         for name, effort in self._external().items():
             yield ("load", name), -effort
 
+    def _netted(self, a: Array, reaction: Array) -> list[tuple[Key, Array]]:
+        """Return loads and reactions; the friction of a joint balances the loads at it before the controller."""
+        loads, reactions = [*self._loads(a)], [*self._reactions(reaction)]
+        whole = np.sum([effort for _, effort in loads], axis=0)
+        own = np.sum([effort for (kind, _), effort in reactions if kind == "friction"] or [np.zeros(len(a))], axis=0)
+        held = np.where(whole * own < 0.0, np.minimum(np.abs(whole), np.abs(own)), 0.0)
+        left = [1.0 - np.divide(held, np.abs(x), out=np.zeros(len(a)), where=x != 0.0) for x in (whole, own)]
+        loads = [(key, effort * left[0]) for key, effort in loads]
+        return loads + [(key, effort * (left[1] if key[0] == "friction" else 1.0)) for key, effort in reactions]
+
     def _reactions(self, reaction: Array) -> Iterator[tuple[Key, Array]]:
         setup = self._judge.setup
         at_low, at_high = (np.abs(self._q - bound) <= AT_LIMIT for bound in (setup.low, setup.high))
@@ -232,13 +245,13 @@ class _Balance:
         for joint, stop, own in zip(setup.joints, stops, -np.diag(reaction)):
             yield ("limit" if stop else "friction", joint), own
 
-    def _shortages(self, command: Array) -> Iterator[tuple[Key, Array]]:
+    def _shortages(self, command: Array, tau: Array) -> Iterator[tuple[Key, Array]]:
         """Yield the differences between the efforts of the law and those that are applied, N·m or N."""
-        setup, tau = self._judge.setup, self._tau
+        setup = self._judge.setup
         saturated = np.abs(tau) >= np.array(setup.limits.effort) * (1.0 - EXACT)
         saturated &= bool(self._judge.held.get("limit_effort"))
         sampled = any(setup.starts.get(name) for name in PERIODS)
-        short = np.diag(self._known.inverse_dynamics(self._q, self._v, command) - tau)
+        short = np.diag(command - tau)
         for i, joint in enumerate(setup.joints):
             if saturated[i] or sampled:
                 yield ("saturation", joint) if saturated[i] else ("sampling", ""), short[i]

@@ -28,6 +28,7 @@ MOVING = ("unstable", "sampling", "damping", "time")  # kinds of errors that sti
 GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
 LASTING = 0.5  # part of an error in motion below which the error does not approach 0
+TOGETHER = 2.0  # ratio of distances from which on position and orientation are out of reach only together
 EXPLAINED = 0.1  # part of an error that a target out of reach may leave to its consequences
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
 
@@ -57,7 +58,7 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     if missed:
         found += damping(judge, ["x", "quat"] if motion in ("oscillating", "diverging") else missed)
     restless = max(_weight("time", "", parts), abs(parts.get(("sampling", ""), 0.0)))
-    if restless > LASTING and not any(cause.kind in MOVING for cause in found):
+    if rests and restless > LASTING and not any(cause.kind in MOVING for cause in found):
         found += unsettled(judge, parts.get(("motion", ""), 0.0), static)
     ranked = _by_parts(judge, found, parts) if parts else _by_kinds(judge, found)
     if not ranked:
@@ -67,7 +68,7 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
 
 
 def _explains(judge: Judge, missed: Sequence[str]) -> bool:
-    """Return whether the inputs that changed last had most of the error before, or fell if efforts are unknown."""
+    """Return whether the inputs that changed last had most of the error before they changed."""
     if judge.latest is None or not missed:
         return False
     from .balance import parts_of_error  # as above
@@ -75,8 +76,6 @@ def _explains(judge: Judge, missed: Sequence[str]) -> bool:
     t, changes = judge.latest
     groups = {name.partition("[")[0] for name, (old, new) in changes.items() if abs(new - old) >= LASTING * abs(old)}
     parts = parts_of_error(judge.until(t), missed).of
-    if not parts:
-        return any(abs(new) < LASTING * abs(old) for old, new in changes.values())
     kinds = {"friction": ("friction", ""), **dict.fromkeys(GAINS, ("gain", ""))}
     each = [kinds.get(group, (kind, group)) for group in groups for kind in ("load", "feedforward")]
     return any(_weight(kind, subject, parts) >= LASTING for kind, subject in each)
@@ -118,13 +117,15 @@ def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, st
             continue  # the error does not approach 0
         grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
         first, most = grows or cause.kind in ("diverged", "degrees"), weight(cause)
+        measured = most if cause.kind == "reach" else _weight(cause.kind, cause.subject, parts)
         own = parts.get((cause.kind, cause.joint), most) if cause.joint else most
         reduces = most <= -SMALL and cause.kind not in MOVING
         opposed = reduces or (cause.kind in FOLLOWING and most < SMALL and abs(own) >= SMALL)
         if first or cause.kind in MOTION or opposed or (most >= SMALL and abs(own) >= SMALL):
             after = inf if cause.kind in MOTION or opposed else -round(most, 1)
-            part = None if cause.kind in MOTION or first else most
-            cause = cause._replace(noted=opposed or cause.kind in MOTION, part=part)
+            after = -inf if cause.kind == "reach" and most >= LASTING else after
+            known = cause.kind not in MOTION and not first and most == measured  # not by a rule of the order
+            cause = cause._replace(noted=opposed or cause.kind in MOTION, part=most if known else None)
             ranked.append(((not first, after, [*KINDS].index(cause.kind), -own, -cause.share), cause))
     causes = [cause for _, cause in sorted(ranked, key=itemgetter(0))]
     root = causes[0].kind if causes else ""
@@ -187,7 +188,9 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     axes, size = setup.rows, max(BAND * judge.aims["x"].first, FLOOR)
     search = partial(nearest, setup.kinematics, setup.frame, axes=axes, target=target)
     best = search(quat=np.empty(0), low=setup.low, high=setup.high, q=judge.end("q"))
-    if best.distance > size:
+    gap = float(np.linalg.norm(judge.end("x") - best.point[axes]))
+    pose = search(quat=quat, low=setup.low, high=setup.high, q=judge.end("q")) if quat.size and gap > size else None
+    if best.distance > size and (pose is None or pose.distance < TOGETHER * best.distance):
         free = np.full(len(setup.joints), inf)
         text = f"the target is out of reach by {best.distance:.4g} m"
         near = (best.q <= setup.low + 1e-6) | (best.q >= setup.high - 1e-6)
@@ -198,25 +201,24 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         if np.abs(target).max() > MILLIMETRES and np.linalg.norm(0.001 * target - best.point[axes]) < best.distance:
             text += "; is it in millimetres?"
         text += f"; the nearest reachable point is {point_text(best.point[axes])} m"
-        gap = float(np.linalg.norm(judge.end("x") - best.point[axes]))
         text += f", {gap:.4g} m from the end effector" * (gap > size)
         part = _part_of(judge, missed, "x", target - best.point[axes])
         yield Cause("reach", text, best.distance, point=tuple(best.point.tolist()), part=part)
     elif quat.size:
-        best = search(quat=quat, low=setup.low, high=setup.high, q=judge.end("q"))
+        best = pose or search(quat=quat, low=setup.low, high=setup.high, q=judge.end("q"))
         if best.distance > size or best.angle > max(BAND * judge.aims["quat"].first, 1e-3):
             text = f"the target pose is out of reach by {best.angle:.4g} rad and {best.distance:.4g} m"
             share = best.distance if best.distance > size else best.angle
             both = _part_of(judge, missed, "x", target - best.point[axes]), _part_of(judge, missed, "quat", best.angle)
-            yield Cause("reach", text, share, point=tuple(best.point.tolist()), part=sum(both))
+            yield Cause("reach", text, share, point=tuple(best.point.tolist()), part=max(both))
 
 
 def _part_of(judge: Judge, missed: Sequence[str], name: str, gap: ArrayLike) -> float:
-    """Return the ratio of a gap, a vector or an angle, to the error late in the run, divided by the missed outputs."""
+    """Return the ratio of a gap, a vector or an angle, to the error of a missed output late in the run."""
     if name not in missed:
         return 0.0
     size = np.sqrt(np.mean(np.square(judge.error_history(name)[judge.late])))
-    return float(np.linalg.norm(gap) / max(size, FLOOR) / len(missed))
+    return float(np.linalg.norm(gap) / max(size, FLOOR))
 
 
 def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:

@@ -16,7 +16,7 @@ from math import inf, nan, sqrt
 import numpy as np
 
 from ..plant.variables import EXACT as EXACT
-from .aim import BAND, SMALLEST_MOVE, Aim
+from .aim import BAND, SMALLEST_MOVE, Aim, errors
 from .cause import MANY_CHANGES
 from .setup import Array, Setup
 
@@ -333,18 +333,3 @@ class Judge:
 def _largest(values: Array) -> Array:
     """Return the largest magnitude of each column."""
     return np.asarray(np.maximum(values.max(axis=0), -values.min(axis=0)))
-
-
-def errors(name: str, now: Array, target: Array) -> tuple[Array, Array]:
-    """Return the error vectors of N samples (empty for an angle) and their magnitudes."""
-    if name == "quat":
-        return np.empty((len(now), 0)), angles(now, target)
-    e = target - now
-    return e, np.sqrt((e * e).sum(axis=1))
-
-
-def angles(quat: Array, target: Array) -> Array:
-    """Return the angle of each unit quaternion from a target quaternion of any length but 0, rad."""
-    target = target / np.linalg.norm(target, axis=-1, keepdims=True)
-    apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
-    return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))

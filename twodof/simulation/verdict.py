@@ -235,7 +235,7 @@ def _missed(judge: Judge) -> list[str]:
     for name, aim in judge.aims.items():
         late = judge.error_history(name)[t >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)]
         held = aim.first <= FLOOR and (np.diff(late) <= 0.0).all()
-        if max(aim.last, late.max(initial=0.0)) > max(BAND * aim.first, HELD if held else FLOOR):
+        if not max(aim.last, late.max(initial=0.0)) <= max(BAND * aim.first, HELD if held else FLOOR) < inf:
             missed.append(name)
     return missed
 
