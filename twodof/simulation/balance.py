@@ -10,7 +10,8 @@ each force and one for the motion:
     e = Kp⁻¹ ((J q̈ + J̇ v + Kd J v) − Kd ẋ_des − ẍ_des + (I − J J⁺) (a − J̇ v)
               + J M⁻¹ (id(q̈) − id_known(q̈) − tau_ext − Jᵀ f_ext + D v − r + s))
 
-Friction first balances the loads at its joint. Under joint control J is the identity and J̇ is 0. The part of a term c in the error is c·e / e·e; all parts add up to 1.
+Friction first balances the loads at its joint. Under joint control J is the identity and J̇ is 0. The part of a term c
+in the error is c·e / e·e; all parts add up to 1.
 Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 8.5.2 and 8.6.2.
 """
 
