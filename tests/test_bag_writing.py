@@ -126,7 +126,7 @@ def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one
 
 @pytest.mark.parametrize("name", [".", "../bag", "../../other/bag"])
 def test_a_bag_with_the_working_directory_in_it_is_not_overwritten(run, tmp_path, monkeypatch, name):
-    path = tmp_path / "work" / "bag"
+    path = tmp_path / "other" / "bag"
     written(run, path, 5)
     monkeypatch.chdir(path)
     with pytest.raises(BagError, match="has the working directory in it"):
