@@ -24,7 +24,7 @@ from report import Figure, machine, print_figures, print_rows, spent
 
 import twodof
 from twodof.simulation.judge import BLOCK, OUTPUTS
-from twodof.simulation.master import judge_of
+from twodof.simulation.stepping import judge_of
 from twodof.sweeps.runner import Job, Runner
 
 TURNS, SAMPLES, RUNS, SWEPT, BLOCKS = 5, 50_000, 20, 400, 15

@@ -21,7 +21,7 @@ ROW, STEP, WIDTH = 30, 64, 760  # px
 
 WAY = (
     ("fmu/instance.py", "Instance.step"),
-    ("simulation/master.py", "samples"),
+    ("simulation/stepping.py", "samples"),
     ("simulation/sample.py", "Sample"),
     ("simulation/master.py", "simulate_together"),
     ("bag/writer.py", "Bag.write"),

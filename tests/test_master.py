@@ -19,8 +19,9 @@ from sinks import Memory
 import twodof
 from twodof.errors import FmuError, InputError, SimulationError
 from twodof.fmu import instantiate
-from twodof.simulation.master import Member, at_rest, simulate_together
+from twodof.simulation.master import Member, simulate_together
 from twodof.simulation.pace import RealTime
+from twodof.simulation.stepping import at_rest
 
 
 class Recorder(twodof.Sink):

@@ -23,7 +23,7 @@ from twodof.cli.main import main
 from twodof.geometry.kinematics import Kinematics
 from twodof.geometry.reach import nearest
 from twodof.plant.urdf import read_urdf
-from twodof.simulation import master
+from twodof.simulation import stepping
 from twodof.simulation.cause import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
@@ -347,7 +347,7 @@ def test_the_nearest_point_of_a_panda_is_that_of_an_evolution() -> None:
 def test_the_verdict_calls_no_function_for_each_sample(native_path: Path) -> None:
     """A sample costs only the writing of its row; the number of calls does not depend on the block size."""
     run = twodof.experiment(native_path, stop_time=1000.0)
-    judge = master.judge_of(run, None)
+    judge = stepping.judge_of(run, None)
     row = memoryview(bytes(8 * sum(len(run.fmu.vector(group)) for group in OUTPUTS)))
 
     def calls(samples: int) -> int:
@@ -383,7 +383,7 @@ def test_blocks_change_no_number(native_path: Path, monkeypatch: pytest.MonkeyPa
     changes = [(0.1 * k, {"x_des": (0.2 + 0.002 * k, 0.05)}) for k in range(1, 12)]
     expected = twodof.simulate(native_path, stop_time=6.0, changes=changes, settings={"Kd": 6.0}).verdict
     for block in (1, 7, 10, 50):
-        monkeypatch.setattr(master, "BLOCK", block)
+        monkeypatch.setattr(stepping, "BLOCK", block)
         found = twodof.simulate(native_path, stop_time=6.0, changes=changes, settings={"Kd": 6.0}).verdict
         assert found.numbers == pytest.approx(expected.numbers, rel=1e-12, abs=1e-15)
         assert found.lines == expected.lines
@@ -482,7 +482,7 @@ def test_a_bag_whose_writer_died_is_judged_by_its_samples(native_path: Path, tmp
 
 def test_a_judge_of_nothing_has_no_number() -> None:
     run = twodof.experiment(fmu_of("arm", "task"))
-    judge = master.judge_of(run, None)
+    judge = stepping.judge_of(run, None)
     assert isinstance(judge, Judge)
     with pytest.raises(twodof.TwoDofError, match="there are no samples"):
         twodof.verdict([], run)

@@ -34,12 +34,12 @@ from .ros.viewer_layouts import layouts as layouts
 from .simulation.experiments import Experiment as Experiment
 from .simulation.experiments import experiment as experiment
 from .simulation.master import run as run
-from .simulation.master import samples as samples
 from .simulation.master import simulate as simulate
 from .simulation.pace import RealTime as RealTime
 from .simulation.run_summary import Summary as Summary
 from .simulation.sample import Sample as Sample
 from .simulation.sample import Sink as Sink
+from .simulation.stepping import samples as samples
 from .simulation.verdict import Verdict as Verdict
 from .sweeps.coordinator import sweep as sweep
 from .sweeps.results import read_sweep as read_sweep

@@ -9,9 +9,9 @@ from pathlib import Path
 from ..errors import InputError
 from ..simulation.experiments import Experiment
 from ..simulation.judge import BLOCK
-from ..simulation.master import judge_of
 from ..simulation.sample import Sample
 from ..simulation.setup import robot_of
+from ..simulation.stepping import judge_of
 from ..simulation.verdict import Verdict, conclude
 from .reader import read_bag
 from .recording import Recording

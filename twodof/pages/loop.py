@@ -18,9 +18,9 @@ from ..errors import BagError, PageError, SimulationError
 from ..files import free_name
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Setting, Value, check_going_on, resolve
-from ..simulation.master import at_rest, samples
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample
+from ..simulation.stepping import at_rest, samples
 
 MOST_ROWS = 1000  # rows kept for pages that have not read them
 MOST_AT_ONCE = 200  # rows in one message

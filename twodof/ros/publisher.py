@@ -11,9 +11,9 @@ from ..errors import InputError, PublishError, SimulationError
 from ..signatures import ignore, never
 from ..simulation.experiments import NANOSECONDS, Experiment
 from ..simulation.input_values import Setting
-from ..simulation.master import at_rest
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
+from ..simulation.stepping import at_rest
 from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic

@@ -14,10 +14,11 @@ from ..errors import InputError
 from ..fmu import Fmu
 from ..signatures import ignore, never, with_keywords_of
 from ..simulation.experiments import Experiment, ExperimentOptions, experiment
-from ..simulation.master import Member, Steer, as_experiment, simulate, simulate_together
+from ..simulation.master import Member, Steer, simulate, simulate_together
 from ..simulation.pace import RealTime
 from ..simulation.run_summary import Summary
 from ..simulation.sample import Sink
+from ..simulation.stepping import as_experiment
 from .messages import check_name
 from .network import Network, network_of_environment, open_domain
 from .publisher import Publisher

@@ -113,9 +113,13 @@ def _models(judge: Judge) -> dict[str, Dynamics]:
 
 
 def _late(judge: Judge) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield q, v and τ at samples of the last quarter of the run and of the time since the last change of a target."""
+    """Yield q, v and τ at samples of the last quarter of the run and of the time since the last change of a target.
+
+    For a target that moves, they are samples of the second half.
+    """
     q, v, tau = (judge.history(name) for name in ("q", "v", "tau"))
-    since = int(np.searchsorted(judge.history(), max(judge.changed, 0.75 * judge.duration)))
+    begin = 0.5 * judge.duration if judge.moving else max(judge.changed, 0.75 * judge.duration)
+    since = int(np.searchsorted(judge.history(), begin))
     yield judge.end("q"), judge.end("v"), judge.end("tau")
     for k in np.linspace(min(since + 1, len(q)), len(q), LOOKED_AT - 1, endpoint=False).astype(int):
         if k < len(q):

@@ -28,6 +28,8 @@ KINDS = {
 """Kinds of causes in their order; a cause may lead to those after it."""
 FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
 SMALL = 0.02  # part of an error below which a cause does not count
+MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
+FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
 MANY_CHANGES = 12  # changes of a target beyond which it counts as moving
 
 
@@ -41,6 +43,8 @@ class Cause(NamedTuple):
         point: nearest reachable position in the root frame, m; () for other kinds.
         noted: whether it is a consequence of another cause or of the motion.
         part: part of the error late in the run that this cause has, as in ``balance``; None if it is unknown.
+        tried: errors at the end of a repeated run without the cause, in words; "" without one.
+        removes: part of the error that was removed in it; None without one.
     """
 
     kind: str
@@ -52,6 +56,8 @@ class Cause(NamedTuple):
     noted: bool = False
     subject: str = ""
     part: float | None = None
+    tried: str = ""
+    removes: float | None = None
 
 
 def point_text(values: Array) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT, GAINS
 from .aim import BAND
-from .cause import FLOOR, KINDS, SMALL, Cause, point_text
+from .cause import FLOOR, FOLLOWING, KINDS, MOTION, SMALL, Cause, point_text
 from .controller_causes import damping, feedforward, gains, load, sampled
 from .judge import AT_LIMIT, Judge
 from .settling_causes import late_change, slow, unsettled
@@ -23,10 +23,8 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 TURNS_ON_PURPOSE = 6.0 * pi  # rad: a joint without limits may turn this far, if it reaches its target
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
-MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
 MOVING = ("unstable", "sampling", "damping", "time")  # kinds of errors that still move
 GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
-FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
 LASTING = 0.5  # part of an error in motion below which the error does not approach 0
 TOGETHER = 2.0  # ratio of distances from which on position and orientation are out of reach only together
 EXPLAINED = 0.1  # part of an error that a target out of reach may leave to its consequences

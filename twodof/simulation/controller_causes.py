@@ -136,7 +136,7 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     sampling = [setup.starts.get(name, 0.0) for name in PERIODS]
     if controller_prefix(judge):  # the controller is a component, and acts at communication points
         sampling[0] = max(sampling[0], setup.step)
-    continuous = bool(judge.aims) and not any(sampling) and not judge.moving
+    continuous = bool(judge.aims) and not any(sampling) and not judge.moving and judge.given("Kp").size > 0
     if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
         return
     if any(sampling) and (found := [*_unstable(judge, *sampling)]):

@@ -7,6 +7,7 @@ from functools import cached_property
 
 from ..notebook import card, picture
 from .judge import Judge
+from .removal import Repeat
 from .sample import Sample
 from .verdict import Verdict, conclude
 
@@ -19,12 +20,14 @@ class Summary:
         last: the last sample.
         wall_time: wall time without loading and initialisation, s.
         stopped: whether a request ended the run before its stop time.
+        repeat: function that repeats the run with other settings, if that is possible.
     """
 
     last: Sample
     wall_time: float
     stopped: bool
     judge: Judge = field(repr=False)
+    repeat: Repeat | None = field(default=None, repr=False)
 
     def _repr_html_(self) -> str:
         facts: dict[str, object] = {"verdict": "; ".join(self.verdict.lines)}
@@ -38,7 +41,7 @@ class Summary:
     @cached_property
     def verdict(self) -> Verdict:
         """Verdict of the run: reached or not, its metrics, and why."""
-        return conclude(self.judge)
+        return conclude(self.judge, repeat=self.repeat)
 
     @property
     def error(self) -> float | None:

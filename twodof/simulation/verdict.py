@@ -17,6 +17,7 @@ from .causes import causes
 from .expressions import expression
 from .judge import BLOCK, OF_THE_END, OUTPUTS, Judge
 from .motion import motion_of
+from .removal import Repeat, by_removal
 from .setup import Array, Setup
 from .verdict_text import lines_of
 
@@ -101,6 +102,8 @@ SHAPE = {
             "noted": bool,
             "subject": str,
             "part": NUMBER | None,
+            "tried": str,
+            "removes": NUMBER | None,
         }
     ],
     "lines": [str],
@@ -165,18 +168,26 @@ def verdict_in(facts: Mapping[str, Any]) -> Verdict:
     return Verdict(**{**known, "numbers": numbers, "causes": found, "lines": tuple(facts["lines"])})
 
 
-def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:
-    """Return the verdict of a judge's samples, with causes that are known beforehand."""
+def conclude(judge: Judge, known: tuple[Cause, ...] = (), repeat: Repeat | None = None) -> Verdict:
+    """Return the verdict of a judge's samples.
+
+    Args:
+        judge: the judge of all samples.
+        known: causes that are known beforehand.
+        repeat: function that repeats the run with other settings, if that is possible.
+    """
     numbers = {name: value for name, value in judge.metrics().items() if not np.isnan(value)}
     t, signals, scale = _signals(judge)
     motion, found, _ = motion_of(t, signals, scale)
     if found is not None:
         numbers |= {"frequency": found.frequency, "damping": found.damping}
     moving = judge.moving
-    missed = _lagging(judge) if moving else _missed(judge)
+    missed = _missed(judge)
     outcome = ("not " if missed else "") + ("followed" if moving else "reached") if judge.aims else "no target"
     motion = "diverging" if known else motion
     why = (*known, *causes(judge, missed, motion))
+    if repeat is not None and missed:
+        why = by_removal(judge, missed, why, repeat, _causes_of)
     lines = lines_of(judge, outcome, motion, numbers, why)
     return Verdict(outcome, motion, judge.count, judge.duration, numbers, why, lines)
 
@@ -229,8 +240,15 @@ def _signals(judge: Judge) -> tuple[Array, Array, float]:
     return t[way], q, max(float(np.ptp(judge.history("q"), axis=0).max()), FLOOR)
 
 
+def _causes_of(judge: Judge) -> tuple[Cause, ...]:
+    """Return the causes of a repeated run."""
+    return causes(judge, _missed(judge), motion_of(*_signals(judge))[0])
+
+
 def _missed(judge: Judge) -> list[str]:
-    """Return the outputs that are not at their targets during the last part of the run."""
+    """Return the outputs that are not at their targets during the last part of the run, or do not follow them."""
+    if judge.moving:
+        return _lagging(judge)
     missed, t = [], judge.history()
     for name, aim in judge.aims.items():
         late = judge.error_history(name)[t >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)]

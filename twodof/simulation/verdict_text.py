@@ -67,16 +67,20 @@ def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
             names = "all other joints" if len(joints) == count - 1 > 1 else names
             grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
     several = len([cause for cause in grouped if not cause.noted]) > 1
-    return [cause._replace(text=_with_part(cause)) for cause in grouped] if several else grouped
+    return [cause._replace(text=_with_part(cause, several)) for cause in grouped]
 
 
-def _with_part(cause: Cause) -> str:
-    """Return a cause's text, before its remedy with its part in the error, if that is known and less than all of it."""
-    if cause.part is None or cause.kind == "reach" or not SMALL <= abs(cause.part) < WHOLE:
-        return cause.text
-    percent, (text, *remedy) = f"{100.0 * abs(cause.part):.2g} %", cause.text.split("; ", 1)
-    part = f"{percent} of the error" if cause.part > 0.0 else f"it reduces the error by {percent}"
-    return "; ".join([f"{text} ({part})", *remedy])
+def _with_part(cause: Cause, several: bool) -> str:
+    """Return a cause's text, before its remedy with the errors without it, or else with its part in the error.
+
+    The part is only printed of one of several causes, and if it is known and less than all of the error.
+    """
+    part = cause.tried
+    if not part and several and cause.part is not None and cause.kind != "reach" and SMALL <= abs(cause.part) < WHOLE:
+        percent = f"{100.0 * abs(cause.part):.2g} %"
+        part = f"{percent} of the error" if cause.part > 0.0 else f"it reduces the error by {percent}"
+    text, *remedy = cause.text.split("; ", 1)
+    return "; ".join([f"{text} ({part})" if part else text, *remedy])
 
 
 def _settings(judge: Judge) -> str:

@@ -19,8 +19,9 @@ from ..fmu import Instance, SystemInstance, instantiate
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import resolve
 from ..simulation.judge import OUTPUTS, Judge
-from ..simulation.master import judge_of, simulate
+from ..simulation.master import simulate
 from ..simulation.setup import Array, robot_of
+from ..simulation.stepping import judge_of
 from ..simulation.verdict import METRICS
 
 Point = tuple[int, tuple[float, ...]]

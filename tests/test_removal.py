@@ -1,0 +1,178 @@
+"""Runs that are repeated without each of the causes of a failure."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from failures import AT_UR5, UR5
+from native_models import robots_folder
+
+import twodof
+from twodof.cli.main import main
+
+CIRCLE = 0.06  # m
+
+
+@pytest.fixture(scope="module")
+def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Build native FMUs of the default arm under both controls, its system of two FMUs, and a UR5's pose control."""
+    folder = tmp_path_factory.mktemp("native")
+    ur5 = {"urdf": robots_folder() / UR5, "frame": "ee_link", "q_start": AT_UR5, "meshes": False}
+    options: dict[str, dict[str, Any]] = {"task": {}, "joint": {"control": "joint"}, "pose": {"control": "pose", **ur5}}
+    built = {
+        name: twodof.build_fmu(folder / f"{name}.fmu", twodof.FmuOptions(**own, native=True))
+        for name, own in options.items()
+    }
+    return {**built, "system": twodof.build_fmu(folder / "arm.ssp", twodof.FmuOptions(part="split", native=True))}
+
+
+def error(summary: twodof.Summary) -> float:
+    """Return the error at the end of a run, m or rad."""
+    found = summary.joint_error if summary.error is None else summary.error
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("fmu", "settings", "kind", "without"),
+    [
+        ("task", {"payload": 0.3}, "load", {"payload_known": True}),
+        ("task", {"f_ext": (0.0, 3.0, 0.0)}, "load", {"f_ext": 0.0}),
+        ("task", {"x_des": (0.5, 0.1)}, "reach", None),
+        ("task", {"Kd": 1.0}, "damping", {"Kd": 2.0 * 50.0**0.5}),
+        ("task", {"Kp": (0.0, 50.0)}, "gain", {"Kp": 50.0}),
+        ("task", {"Kp": 0.0}, "gain", {"Kp": 50.0}),
+        ("task", {"xdd_des": (0.0, 1.0)}, "feedforward", {"xdd_des": 0.0}),
+        ("task", {"q_min": (0.2, -3.0)}, "limit", {"q_min": -1e9, "q_max": 1e9}),
+        ("joint", {"q_des": (90.0, 0.35)}, "degrees", {"q_des": (1.5707963267948966, 0.35)}),
+        ("joint", {"q_des": (0.9, 0.8), "friction": (0.3, 0.1)}, "friction", {"friction": 0.0}),
+        ("joint", {"q_des": (0.9, 0.8), "control_period": 0.06, "Kd": 60.0}, "unstable", {"control_period": 0.0}),
+        ("joint", {"q_des": (0.9, 0.8), "damping": 20.0}, "load", {"damping": 0.0}),
+        ("joint", {"q_des": (0.9, 0.8), "limit_effort": True, "payload": 10.0, "payload_known": True}, "saturation",
+         {"limit_effort": False}),
+        ("system", {"plant.payload": 1.0}, "load", {"controller.payload_known": True, "controller.payload": 1.0}),
+        ("system", {"controller.armature": (0.0321, 0.00376)}, "load", {"controller.armature": 0.0}),
+    ],
+)  # fmt: skip
+def test_the_error_without_the_first_cause_is_that_of_a_run_without_it(fmus, fmu, settings, kind, without) -> None:
+    cause = twodof.simulate(fmus[fmu], settings=settings).verdict.causes[0]
+    without = {"x_des": cause.point[:2]} if without is None else without
+    cured = twodof.simulate(fmus[fmu], settings={**settings, **without})
+    assert cause.kind == kind and not cause.noted
+    assert float(re.findall(r"([\d.e-]+) (?:m|rad)$", cause.tried)[0]) == pytest.approx(error(cured), rel=6e-3)
+    assert cause.removes is not None and cause.removes > 0.5
+
+
+def test_the_remaining_time_is_tried(fmus) -> None:
+    first = twodof.simulate(fmus["task"], stop_time=1.0).verdict.lines[0]
+    left, tried, size = re.findall(r"about ([\d.]+) s more \(at ([\d.]+) s: ([\d.e-]+) m\)", first)[0]
+    assert float(tried) == pytest.approx(1.0 + float(left), abs=0.01)
+    assert float(size) <= 0.02 * twodof.simulate(fmus["task"], stop_time=1.0).judge.aims["x"].first
+
+
+@pytest.mark.parametrize(
+    ("fmu", "settings", "words"),
+    [
+        # a load and a target out of reach, which is more of the error
+        ("task", {"x_des": (1.0, 0.05), "payload": 0.3}, ["out of reach by 0.7012 m", "also .* payload of 0.3 kg"]),
+        # a load that moves joints without a gain: the gain alone cures nothing
+        ("joint", {"q_des": (0.9, 0.8), "Kp": 0.0, "f_ext": (0.0, -0.93, 0.0)}, ["know f_ext", "also Kp = 0"]),
+        # joints are thrown to their limits by a wrong model; the small feedforward has no part
+        ("system", {"controller.armature": (0.0321, 0.00376), "xd_des": (0.001, 0.0)}, ["model has armature"]),
+        # a limit that a coarse encoder throws a joint to
+        (
+            "task",
+            {"control_period": 0.001, "q_resolution": 0.05, "v_from_q": True, "f_ext": (0.0, 0.02, 0.0)},
+            ["acts with control_period = 0.001, q_resolution = 0.05, v_from_q = 1 .with a continuous controller"],
+        ),
+        # the joint that is far off is slow; the load moves the other one
+        (
+            "joint",
+            {"q_des": (0.9, 0.8), "friction": (0.3, 0.1), "payload": 0.2},
+            ["payload of 0.2 kg", "also without it, joint 'joint1' creeps"],
+        ),
+        (
+            "pose",
+            {"x_des": (0.4, 0.1, 0.4), "quat_des": (0.3, 0.9, 0.1, 0.2), "payload": 0.2, "Kp_rot": 5.0},
+            ["the orientation still approaches.*: 0.0103 m and 0.0484 rad", "", "payload.*: 0.000181 m and 0.583 rad"],
+        ),
+    ],
+)
+def test_several_causes_are_ranked_by_the_errors_without_each(fmus, fmu, settings, words) -> None:
+    lines = twodof.simulate(fmus[fmu], settings=settings).verdict.lines
+    for line, expected in zip(lines, words):
+        assert re.search(expected, line), lines
+    assert "xd_des" not in " ".join(lines)
+
+
+def test_causes_that_fail_only_together_keep_their_order(fmus) -> None:
+    both = {"q_des": (0.9, 0.8), "friction": 0.1, "payload": 0.1}
+    sizes = [error(twodof.simulate(fmus["joint"], settings=both | one)) for one in ({}, {"payload_known": True})]
+    verdict = twodof.simulate(fmus["joint"], settings=both).verdict
+    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
+    assert "payload of 0.1 kg (without it: 0.45 rad)" in verdict.lines[0]
+    assert "also without it, joint 'joint2' sticks" in verdict.lines[1]
+
+
+def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus, tmp_path: Path) -> None:
+    from math import cos, sin
+
+    rows = ["time,x_des[1],x_des[2],xd_des[1],xd_des[2],xdd_des[1],xdd_des[2]"]
+    for t in (0.01 * k for k in range(600)):
+        c, s = CIRCLE * cos(t), CIRCLE * sin(t)
+        rows.append(",".join(f"{value:.9g}" for value in (t, 0.2 + c, 0.05 + s, -s, c, -c, -s)))
+    (tmp_path / "circle.csv").write_text("\n".join(rows))
+    run = {"stop_time": 6.0, "input_file": tmp_path / "circle.csv"}
+    assert twodof.simulate(fmus["task"], **run).verdict.outcome == "followed"
+    first = twodof.simulate(fmus["task"], settings={"q_max": (3.0, 1.6)}, **run).verdict.lines[0]
+    assert "'joint2' stood at its upper limit 1.6 rad" in first and "without limits of the joints: 0.000" in first
+
+
+class Steering(twodof.Sink):
+    """A sink that commands no inputs."""
+
+    def command(self, *_: object) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    "options", [{"steer": lambda: None}, {"stop_time": 51.0}, {"stop": iter([False] * 20 + [True] * 9).__next__}]
+)
+def test_a_run_that_cannot_be_repeated_has_no_trial(fmus, options) -> None:
+    causes = twodof.simulate(fmus["task"], settings={"payload": 0.3}, **options).verdict.causes
+    assert causes and not any(cause.tried or cause.removes is not None for cause in causes)
+
+
+def test_a_run_with_a_steering_sink_and_one_of_a_python_fmu_have_no_trial(fmus, fmu_path: Path) -> None:
+    steered = twodof.simulate(fmus["task"], Steering(), settings={"payload": 0.3})
+    python = twodof.simulate(fmu_path, settings={"payload": 0.3})
+    assert not any(cause.tried for summary in (steered, python) for cause in summary.verdict.causes)
+    assert [c.kind for c in python.verdict.causes] == [c.kind for c in steered.verdict.causes]
+
+
+def test_a_repetition_that_fails_is_left_out_and_logs_nothing(fmus, caplog: pytest.LogCaptureFixture) -> None:
+    summary = twodof.simulate(fmus["task"], settings={"f_ext": (1e9, 0.0, 0.0)}, stop_time=0.5)
+    logged = len(caplog.records)
+    assert any(cause.kind == "limit" and not cause.tried for cause in summary.verdict.causes)
+    assert len(caplog.records) == logged
+
+
+def test_a_replaced_fmu_leaves_the_causes_as_they_are(fmus, tmp_path: Path) -> None:
+    path = tmp_path / "arm.fmu"
+    path.write_bytes(fmus["task"].read_bytes())
+    summary = twodof.simulate(path, settings={"payload": 0.3})
+    path.write_bytes(fmus["joint"].read_bytes())
+    assert [(cause.kind, cause.tried) for cause in summary.verdict.causes] == [("load", "")]
+
+
+def test_a_bag_has_the_errors_without_the_causes(fmus, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "bag"
+    assert main(["run", str(fmus["task"]), "--set", "payload=0.3", "-o", str(bag)]) == 0
+    printed = capsys.readouterr().out
+    assert main(["info", str(bag)]) == 0
+    line = "(without it: 0.000224 m); set payload_known=true"
+    assert line in printed and line in capsys.readouterr().out
+    assert twodof.verdict(bag).causes[0].removes == pytest.approx(1.0, abs=0.01)
