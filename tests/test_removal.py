@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from math import cos, sin
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from native_models import robots_folder
 
 import twodof
 from twodof.cli.main import main
+from twodof.simulation.experiments import ExperimentOptions
 
 CIRCLE = 0.06  # m
 
@@ -57,7 +59,9 @@ def error(summary: twodof.Summary) -> float:
         ("system", {"controller.armature": (0.0321, 0.00376)}, "load", {"controller.armature": 0.0}),
     ],
 )  # fmt: skip
-def test_the_error_without_the_first_cause_is_that_of_a_run_without_it(fmus, fmu, settings, kind, without) -> None:
+def test_the_error_without_the_first_cause_is_that_of_a_run_without_it(
+    fmus: dict[str, Path], fmu, settings, kind, without
+) -> None:
     cause = twodof.simulate(fmus[fmu], settings=settings).verdict.causes[0]
     without = {"x_des": cause.point[:2]} if without is None else without
     cured = twodof.simulate(fmus[fmu], settings={**settings, **without})
@@ -66,7 +70,7 @@ def test_the_error_without_the_first_cause_is_that_of_a_run_without_it(fmus, fmu
     assert cause.removes is not None and cause.removes > 0.5
 
 
-def test_the_remaining_time_is_tried(fmus) -> None:
+def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
     first = twodof.simulate(fmus["task"], stop_time=1.0).verdict.lines[0]
     left, tried, size = re.findall(r"about ([\d.]+) s more \(at ([\d.]+) s: ([\d.e-]+) m\)", first)[0]
     assert float(tried) == pytest.approx(1.0 + float(left), abs=0.01)
@@ -101,14 +105,14 @@ def test_the_remaining_time_is_tried(fmus) -> None:
         ),
     ],
 )
-def test_several_causes_are_ranked_by_the_errors_without_each(fmus, fmu, settings, words) -> None:
+def test_several_causes_are_ranked_by_the_errors_without_each(fmus: dict[str, Path], fmu, settings, words) -> None:
     lines = twodof.simulate(fmus[fmu], settings=settings).verdict.lines
     for line, expected in zip(lines, words):
         assert re.search(expected, line), lines
     assert "xd_des" not in " ".join(lines)
 
 
-def test_causes_that_fail_only_together_keep_their_order(fmus) -> None:
+def test_causes_that_fail_only_together_keep_their_order(fmus: dict[str, Path]) -> None:
     both = {"q_des": (0.9, 0.8), "friction": 0.1, "payload": 0.1}
     sizes = [error(twodof.simulate(fmus["joint"], settings=both | one)) for one in ({}, {"payload_known": True})]
     verdict = twodof.simulate(fmus["joint"], settings=both).verdict
@@ -117,15 +121,13 @@ def test_causes_that_fail_only_together_keep_their_order(fmus) -> None:
     assert "also without it, joint 'joint2' sticks" in verdict.lines[1]
 
 
-def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus, tmp_path: Path) -> None:
-    from math import cos, sin
-
+def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus: dict[str, Path], tmp_path: Path) -> None:
     rows = ["time,x_des[1],x_des[2],xd_des[1],xd_des[2],xdd_des[1],xdd_des[2]"]
     for t in (0.01 * k for k in range(600)):
         c, s = CIRCLE * cos(t), CIRCLE * sin(t)
         rows.append(",".join(f"{value:.9g}" for value in (t, 0.2 + c, 0.05 + s, -s, c, -c, -s)))
     (tmp_path / "circle.csv").write_text("\n".join(rows))
-    run = {"stop_time": 6.0, "input_file": tmp_path / "circle.csv"}
+    run: ExperimentOptions = {"stop_time": 6.0, "input_file": tmp_path / "circle.csv"}
     assert twodof.simulate(fmus["task"], **run).verdict.outcome == "followed"
     first = twodof.simulate(fmus["task"], settings={"q_max": (3.0, 1.6)}, **run).verdict.lines[0]
     assert "'joint2' stood at its upper limit 1.6 rad" in first and "without limits of the joints: 0.000" in first
@@ -141,26 +143,30 @@ class Steering(twodof.Sink):
 @pytest.mark.parametrize(
     "options", [{"steer": lambda: None}, {"stop_time": 51.0}, {"stop": iter([False] * 20 + [True] * 9).__next__}]
 )
-def test_a_run_that_cannot_be_repeated_has_no_trial(fmus, options) -> None:
+def test_a_run_that_cannot_be_repeated_has_no_trial(fmus: dict[str, Path], options) -> None:
     causes = twodof.simulate(fmus["task"], settings={"payload": 0.3}, **options).verdict.causes
     assert causes and not any(cause.tried or cause.removes is not None for cause in causes)
 
 
-def test_a_run_with_a_steering_sink_and_one_of_a_python_fmu_have_no_trial(fmus, fmu_path: Path) -> None:
+def test_a_run_with_a_steering_sink_and_one_of_a_python_fmu_have_no_trial(
+    fmus: dict[str, Path], fmu_path: Path
+) -> None:
     steered = twodof.simulate(fmus["task"], Steering(), settings={"payload": 0.3})
     python = twodof.simulate(fmu_path, settings={"payload": 0.3})
     assert not any(cause.tried for summary in (steered, python) for cause in summary.verdict.causes)
     assert [c.kind for c in python.verdict.causes] == [c.kind for c in steered.verdict.causes]
 
 
-def test_a_repetition_that_fails_is_left_out_and_logs_nothing(fmus, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_repetition_that_fails_is_left_out_and_logs_nothing(
+    fmus: dict[str, Path], caplog: pytest.LogCaptureFixture
+) -> None:
     summary = twodof.simulate(fmus["task"], settings={"f_ext": (1e9, 0.0, 0.0)}, stop_time=0.5)
     logged = len(caplog.records)
     assert any(cause.kind == "limit" and not cause.tried for cause in summary.verdict.causes)
     assert len(caplog.records) == logged
 
 
-def test_a_replaced_fmu_leaves_the_causes_as_they_are(fmus, tmp_path: Path) -> None:
+def test_a_replaced_fmu_leaves_the_causes_as_they_are(fmus: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "arm.fmu"
     path.write_bytes(fmus["task"].read_bytes())
     summary = twodof.simulate(path, settings={"payload": 0.3})
@@ -168,7 +174,9 @@ def test_a_replaced_fmu_leaves_the_causes_as_they_are(fmus, tmp_path: Path) -> N
     assert [(cause.kind, cause.tried) for cause in summary.verdict.causes] == [("load", "")]
 
 
-def test_a_bag_has_the_errors_without_the_causes(fmus, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bag_has_the_errors_without_the_causes(
+    fmus: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bag = tmp_path / "bag"
     assert main(["run", str(fmus["task"]), "--set", "payload=0.3", "-o", str(bag)]) == 0
     printed = capsys.readouterr().out
