@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from math import cos, sin
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ from native_models import robots_folder
 
 import twodof
 from twodof.cli.main import main
-from twodof.simulation.experiments import ExperimentOptions
 
 CIRCLE = 0.06  # m
 
@@ -127,9 +127,9 @@ def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus: dict[str, Path], t
         c, s = CIRCLE * cos(t), CIRCLE * sin(t)
         rows.append(",".join(f"{value:.9g}" for value in (t, 0.2 + c, 0.05 + s, -s, c, -c, -s)))
     (tmp_path / "circle.csv").write_text("\n".join(rows))
-    run: ExperimentOptions = {"stop_time": 6.0, "input_file": tmp_path / "circle.csv"}
-    assert twodof.simulate(fmus["task"], **run).verdict.outcome == "followed"
-    first = twodof.simulate(fmus["task"], settings={"q_max": (3.0, 1.6)}, **run).verdict.lines[0]
+    follow = partial(twodof.simulate, fmus["task"], stop_time=6.0, input_file=tmp_path / "circle.csv")
+    assert follow().verdict.outcome == "followed"
+    first = follow(settings={"q_max": (3.0, 1.6)}).verdict.lines[0]
     assert "'joint2' stood at its upper limit 1.6 rad" in first and "without limits of the joints: 0.000" in first
 
 
