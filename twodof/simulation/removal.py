@@ -162,9 +162,9 @@ def _without(judge: Judge, cause: Cause) -> Repetition | None:
             return plan("with critical damping", _critical(judge))
         case "degrees":
             large = {name: value for name, value in held.items() if name.startswith(("q_des[", "q_start["))}
-            return plan("in degrees", {name: radians(value) for name, value in large.items() if abs(value) > TURN})
+            return plan("read as degrees", {name: radians(value) for name, value in large.items() if abs(value) > TURN})
         case "reach" if not judge.wanted("quat").size and not judge.moving:
-            return plan("for that target", _in_reach(judge, cause))
+            return plan("with a target in reach", _in_reach(judge, cause))
         case "time" if not judge.moving:
             return Repetition(f"at {judge.duration + cause.share:.4g} s", longer=cause.share)
     return None
