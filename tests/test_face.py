@@ -238,6 +238,12 @@ def test_nothing_but_building_needs_pinocchio(native_path, tmp_path):
     assert program(["pinocchio"], code, tmp_path) == "1\n"
 
 
+def test_a_run_that_reaches_its_target_imports_no_scipy(native_path, tmp_path):
+    """It would take as long as all the rest of a short run."""
+    code = "fmu, = sys.argv[1:]\nassert main(['run', fmu]) == 0\nprint('scipy' in sys.modules)"
+    assert program([], code, tmp_path, native_path).splitlines()[-1] == "False"
+
+
 ABSENT = {
     "twodof.view('bag')": "view",
     "twodof.live('x.fmu')": "view",

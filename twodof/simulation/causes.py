@@ -39,11 +39,14 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         missed: outputs that are not at their targets: "x", "quat" or "q".
         motion: motion at the end of the run.
     """
-    from .balance import parts_of_error  # SciPy takes half a second to import
-
-    (parts, static), rests = parts_of_error(judge, missed), not judge.moving
+    parts: Mapping[tuple[str, str], float] = {}
+    static: Mapping[str, float] = {}
+    rests = not judge.moving
     found = [*_degrees(judge, missed), *_beyond_limits(judge)]
     if missed:
+        from .balance import parts_of_error  # SciPy takes half a second to import
+
+        parts, static = parts_of_error(judge, missed)
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
         sticking = [*_friction(judge, missed, parts)]  # without parts, the rate of an error then tells nothing
         reach = max((cause.share for cause in found if cause.kind == "reach"), default=0.0)
@@ -58,7 +61,7 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     restless = max(_weight("time", "", parts), abs(parts.get(("sampling", ""), 0.0)))
     if rests and restless > LASTING and not any(cause.kind in MOVING for cause in found):
         found += unsettled(judge, parts.get(("motion", ""), 0.0), static)
-    ranked = _by_parts(judge, found, parts) if parts else _by_kinds(judge, found)
+    ranked = _by_parts(judge, found, parts) if parts else _by_kinds(judge, found) if found else []
     if not ranked:
         return ()
     root, *others = ranked[:MOST]
