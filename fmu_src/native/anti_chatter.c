@@ -3,10 +3,6 @@
 #include <math.h>
 #include <string.h>
 
-#include "dormand_prince.h"
-#include "event_search.h"
-#include "stops.h"
-
 static const double CHATTER_TIME = 0.5, SHORT_CHATTER_TIME = 1.0 / 4096.0, FIRST_HOLD = 1.0 / 16777216.0,
                     HOLD_GROWTH = 8.0, HOLD_OF_ALL = 1.0 / 512.0;
 

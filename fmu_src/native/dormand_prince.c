@@ -1,11 +1,29 @@
 /* Coefficients, error norm and dense output are those of SciPy's RK45 and plant/dormand_prince.py.
 
    Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986. */
-#include "dormand_prince.h"
-
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
+
+enum { STAGES = 6 }; /* evaluations of the equations of motion in one step */
+
+/* One integration step from y to y_new in one regime, by Dormand–Prince, ROS34PW2 or Heun. The first and the last of the
+   derivatives K are those at the ends; the last stage is y_new. */
+typedef struct {
+    const Plant *plant;
+    double size;                           /* s */
+    double y[N_STATES], y_new[N_STATES];
+    int stages;                            /* number of stages, at most STAGES */
+    const double (*P)[4];                  /* weights of K in the dense output */
+    double K[STAGES + 1][N_STATES];
+    double effort[STAGES + 1][N_JOINTS];   /* the efforts that hold joints at rest */
+    double rounding;                       /* bound on the rounding error of the holding efforts */
+    long evaluations;                      /* evaluations of the equations of motion so far */
+    double Q[N_STATES][4];                 /* coefficients of the dense output */
+    double margin, margin_new;             /* margins of the rank at y and y_new */
+    int crossed;                           /* whether the rank has changed in the communication step */
+    Stops stops;
+} Step;
 
 /* Row s has the weights of the derivatives of stages 0…s; the last row is the fifth-order solution. */
 static const double A[STAGES][STAGES] = {
@@ -30,8 +48,10 @@ static const double P[STAGES + 1][4] = {
 };
 static const double QUADRATIC[2][4] = {{1, -0.5, 0, 0}, {0, 0.5, 0, 0}};
 
-void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS],
-              double *margin)
+/* q̈ at a state in the regime of the step, the efforts that hold joints at rest, and the margin of the rank,
+   which may be NULL. */
+static void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS],
+                     double *margin)
 {
     const Stops *stops = &step->stops;
     const double *v = y + N_JOINTS;
@@ -44,7 +64,8 @@ void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double e
     restrain(step->plant, stops, y, a, effort);
 }
 
-double error_norm(const Step *step, const double error[N_STATES])
+/* Root mean square of error/tolerance. */
+static double error_norm(const Step *step, const double error[N_STATES])
 {
     const double rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
     double sum = 0.0;
@@ -56,7 +77,8 @@ double error_norm(const Step *step, const double error[N_STATES])
     return sqrt(sum / N_STATES);
 }
 
-double dormand_prince(Step *step)
+/* Fill y_new, K[1…6] and P from y and K[0]; return the norm of the error. A step passes if it is below 1. */
+static double dormand_prince(Step *step)
 {
     double *y_new = step->y_new, error[N_STATES];
     for (int stage = 1; stage <= STAGES; stage++) {
@@ -84,7 +106,9 @@ double dormand_prince(Step *step)
     return error_norm(step, error);
 }
 
-double heun(Step *step)
+/* The same with a method of second order, with K[0…1], of which K[1] is at the state of Euler's method; its error is
+   the norm. */
+static double heun(Step *step)
 {
     double error[N_STATES];
     const double *k = step->K[0], *k_new = step->K[1];
@@ -101,7 +125,8 @@ double heun(Step *step)
     return error_norm(step, error);
 }
 
-void interpolate(Step *step)
+/* Fill Q, for dense_output. */
+static void interpolate(Step *step)
 {
     for (int i = 0; i < N_STATES; i++)
         for (int k = 0; k < 4; k++) {
@@ -111,7 +136,8 @@ void interpolate(Step *step)
         }
 }
 
-double dense_output(const Step *step, double passed, int component)
+/* A component of the state at a time within the step. */
+static double dense_output(const Step *step, double passed, int component)
 {
     const double x = passed / step->size, *c = step->Q[component];
     const double slope = c[0] + c[1] * x + c[2] * (x * x) + c[3] * (x * x * x);

@@ -1,35 +1,22 @@
-/* Find the first event within an integration step, on its dense output. The rules are those of
-   plant/event_search.py.
-
-   An event is a time at which a margin becomes negative. Margins are the distance of a joint from a limit, the velocity
-   of a joint that slips, the distance of a holding effort from its bounds, and the margin of the rank of J⁺. Positions
-   and velocities are polynomials with known turning points. The other margins are sampled as often as their rates of
-   change require. */
-#include "event_search.h"
-
+/* Find the first event within an integration step, on its dense output. The rules and their derivation are in
+   plant/event_search.py. */
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
 
-#ifdef HAS_RCOND
-#include "control.h"
-#endif
-
-/* Bounds on the weights of Dormand and Prince's interpolant: the largest sum of their magnitudes, and the largest sum
-   of the magnitudes of their rates. The cubic has smaller ones, 1.07 and 2. */
+/* Bounds for Dormand and Prince's interpolant; the cubic has smaller ones, 1.07 and 2. */
 static const double REACH = 1.66, PACE = 3.72;
-/* Between the stages, the margin of an effort falls below their smallest value by less than the range of their values.
-   If it may therefore be below zero, it is sampled at the ends of LOOKS equal intervals, and at each minimum of the
-   polynomial through these samples that is below DOUBT times their range. */
 enum { LOOKS = 4 };
 static const double DOUBT = 0.25;
-/* Halvings of a step in the search; shorter excursions are ignored. */
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
-/* The same for a release, at which the acceleration is 0, so that the error of the state grows with its square. */
 static const double RELEASE_RESOLUTION = 1.0 / 67108864.0; /* 2⁻²⁶ */
-/* Fraction of the largest step. Joints that reach rigid stops within it of an event stop with that event. */
 static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
+
+/* The event at the end of a step: joints that reached a limit, and joints that slipped and came to rest. */
+typedef struct {
+    int stopped[N_JOINTS], arrested[N_JOINTS];
+} Event;
 
 /* A margin at a time within the step, negative after the end of the regime. Some margins have one value for each
    component of the state. */
@@ -304,7 +291,9 @@ static void name_event(Step *step, double passed, const double y[N_STATES], Even
     }
 }
 
-double first_event(Step *step, int rank_held, Event *event)
+/* First time in (0, size] at which the regime of the step ends; y_new becomes the state there. 0 if it does not end.
+   With rank_held, only a drop of the rank of J⁺ counts. */
+static double first_event(Step *step, int rank_held, Event *event)
 {
     const double *value = step->plant->value;
     int near[N_STATES];

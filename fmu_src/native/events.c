@@ -2,15 +2,9 @@
    position just past the limit, or, for a joint at rest there, the effort that presses it against the limit. The
    indicator of friction is the velocity in the direction of slip, or, for a joint that sticks, the distance of the
    holding effort from its bounds. Offsets keep each indicator away from zero after its event. */
-#include "stops.h"
-
 #include <float.h>
 #include <math.h>
 #include <string.h>
-
-#ifdef HAS_RCOND
-#include "control.h"
-#endif
 
 /* Distance of an event past a limit, relative to max(1, |limit|): some hundred units in the last place. */
 static const double PAST = 1e-13;

@@ -4,15 +4,21 @@
    Every communication step restarts with the step min(max_step, h).
 
    Source: Hairer, Nørsett & Wanner, "Solving ODEs I", II.4 and II.6. */
-#include "integrator.h"
-
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
 
-#include "dormand_prince.h"
-#include "event_search.h"
-#include "stops.h"
+/* Why a communication step cannot be done. */
+typedef struct {
+    enum { NOT_FINITE,      /* the equations of motion gave a value that is not finite */
+           MANY_STEPS,      /* max_step requires more evaluations than the budget */
+           SHORT_PERIOD,    /* control_period requires more than the budget */
+           MANY_EVALUATIONS,
+           SMALL_STEPS      /* steps below the resolution of time */
+    } reason;
+    int joint;   /* the joint that changes fastest, for the last two */
+    double rate; /* the joint's rate of change, 1/s */
+} Failure;
 
 /* Values of the parameter integrator. */
 enum { AUTOMATIC, DORMAND_PRINCE, STIFF };
@@ -79,9 +85,7 @@ static void find_fastest(Step *step, Failure *failure)
     }
 }
 
-/* Fraction of the tolerances that a step may use. Once the rank has changed in a communication step, the steps of
-   max_step share them by their lengths: a motion to and fro across a singularity takes so many of them within a
-   millisecond that their errors, each within the tolerances, would add up to energy. */
+/* Fraction of the tolerances that a step may use: after a change of the rank, steps share them (plant/regime.py). */
 static double share_of_tolerance(const Step *step)
 {
     const double *value = step->plant->value;
@@ -182,7 +186,10 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
     return NAN;
 }
 
-int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N_JOINTS], Failure *failure)
+/* Advance the plant's state by h seconds with inputs held, and locate joint stops. On failure return false and leave
+   the plant unchanged. evaluations counts those of the communication step so far, and is updated. stopped_at, which may
+   be NULL, receives the time within the step at which each joint first reached a limit, or HUGE_VAL. */
+static int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N_JOINTS], Failure *failure)
 {
     if (IS_CONTROLLER)
         return 1;

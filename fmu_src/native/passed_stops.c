@@ -1,11 +1,8 @@
 /* Find the stops that an importer's step passed unnoticed. The quintic through position, velocity and acceleration at
    both ends shows whether a joint reversed near or outside its limit. If a joint did, the engine integrates the step
    again from its start, and the engine's stops are the result. */
-
 #include <math.h>
 #include <string.h>
-
-#include "integrator.h"
 
 /* A step of the importer. */
 typedef struct {

@@ -7,13 +7,22 @@
    for any a, where s are the directions in which joints slip against their friction F. With a = q̈_cmd, the dynamics
    cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ
    where it is known; the armature is in both. */
-#include "plant.h"
-
 #include <stddef.h>
 #include <string.h>
 
 #include "control.h"
 #include "mechanism.h"
+
+/* All variables of the FMU by value reference: inputs, outputs (q and v are the state; x and tau
+   are computed on demand) and parameters. Booleans are 0 or 1. */
+typedef struct {
+    double value[N_VARIABLES];
+} Plant;
+
+enum { N_STATES = 2 * N_JOINTS }; /* q and v are adjacent in the table, and so are their derivatives */
+
+/* States of Model Exchange, and its event indicators, which a controller alone does not have. */
+enum { N_CONTINUOUS = IS_CONTROLLER ? 0 : N_STATES, N_EVENTS = IS_CONTROLLER ? 0 : N_INDICATORS };
 
 static double saturated(double tau, double limit)
 {
@@ -141,8 +150,11 @@ static int find_excess(const double value[N_VARIABLES], const JointPosition join
     return rank;
 }
 
-int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                 const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
+/* q̈ by the equations of motion at a state, with the given rank of J⁺. Joints slip in the given directions (−1, 1; 0 or
+   NULL: no friction), and joints at rest are free. Returns the rank. The margin, which may be NULL, is negative if the
+   singular values give another rank. */
+INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                          const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
 {
     JointPosition joint[N_BODIES];
     double excess[N_JOINTS], further[N_JOINTS];
@@ -162,9 +174,10 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
 }
 
 #ifndef IS_COMPLEX
-void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                          const int slip[N_JOINTS], int rank, const int rests[N_JOINTS], double a[N_JOINTS],
-                          double reaction[N_JOINTS], double *margin)
+/* q̈ with reactions that keep some joints at rest, and the reactions, which act on all joints; else as acceleration. */
+static void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                                 const int slip[N_JOINTS], int rank, const int rests[N_JOINTS], double a[N_JOINTS],
+                                 double reaction[N_JOINTS], double *margin)
 {
     JointPosition joint[N_BODIES];
     EndBody end_body;
@@ -183,9 +196,10 @@ void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const do
     }
 }
 
-void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
-                   const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],
-                   double reaction[N_JOINTS])
+/* a and λ of M(q) a = τ + λ, as in hybrid_dynamics. */
+static void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
+                          const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],
+                          double reaction[N_JOINTS])
 {
     JointPosition joint[N_BODIES];
     EndBody end_body;
@@ -226,7 +240,9 @@ static void compute_equations(Plant *plant, const JointPosition joint[N_BODIES],
 #endif
 }
 
-void compute_position(Plant *plant)
+/* Compute the outputs x and xd, with an orientation quat and omega, and on request M, h, J and drift, at the plant's
+   state. */
+INTERNAL void compute_position(Plant *plant)
 {
     JointPosition joint[N_BODIES];
     TaskFrame task;
@@ -243,8 +259,9 @@ void compute_position(Plant *plant)
     compute_equations(plant, joint, &task);
 }
 
-void control_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS], int rank,
-                    double tau[N_JOINTS])
+/* τ of the control law for a measured state, within effort limits, with the given rank of J⁺. */
+INTERNAL void control_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+                             double tau[N_JOINTS])
 {
     const double *value = plant->value;
     double given[N_JOINTS];
@@ -255,7 +272,9 @@ void control_effort(const Plant *plant, const double q[N_JOINTS], const double v
     limit_effort(value, tau);
 }
 
-void compute_effort(Plant *plant, int rank)
+/* Compute the output tau, the applied control effort, at the plant's state and inputs, with the given rank of J⁺. The
+   effort of a sampled controller is held and stays as it is. */
+INTERNAL void compute_effort(Plant *plant, int rank)
 {
     if (!is_held(plant->value))
         control_effort(plant, &plant->value[Q], &plant->value[V], rank, &plant->value[TAU]);

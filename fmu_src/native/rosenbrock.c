@@ -1,20 +1,11 @@
-/* The rules are those of plant/rosenbrock.py. The method has its order with any approximation T of the Jacobian, and is
-   L-stable for the terms in T. Here T contains the joint damping D and q̇ = v:
-
-       T = [ 0      1   ]        (1 − h γ T) uᵢ = h γ f(y + Σ aᵢⱼ uⱼ) + γ Σ cᵢⱼ uⱼ,    j < i
-           [ 0   −M⁻¹D  ]        y_new = y + Σ mᵢ uᵢ
-
-   (1 + h γ M⁻¹D) x = r has the solution x = r − (M + h γ D)⁻¹ h γ D r, in which h γ D acts like an armature. The dense
-   output of v begins and ends with the accelerations, so that a joint begins to slip in the right direction. For a
-   stiff joint, small errors of v become large errors of q̈; the acceleration of q's cubic then replaces q̈.
+/* One step of ROS34PW2 for stiff joint damping D, and its dense output, by the equations of plant/rosenbrock.py. Here
+   (1 + h γ M⁻¹D) x = r has the solution x = r − (M + h γ D)⁻¹ h γ D r, in which h γ D acts like an armature.
 
    Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of
    index 1", BIT 45(4), 2005, in the form without products by T of Hairer & Wanner, "Solving ODEs II", IV.7. */
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
-
-#include "dormand_prince.h"
 
 enum { N_INCREMENTS = 4 };
 static const double GAMMA = 0.435866521508459;

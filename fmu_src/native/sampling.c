@@ -1,14 +1,5 @@
-/* Sampled control by the rules of plant/sampling.py:
-
-       t_k    = start + k T                          an exact integer k, T = control_period
-       q_meas = ρ round(q/ρ) + noise                 at t_k; ρ = q_resolution, ties to even
-       v_meas = v + noise, or (q_meas(t_k) − q_meas(t_(k−1)))/T, 0 at the first sample
-       τ_k    = law(q_meas, v_meas, inputs at t_k)   acts from t_k + D until t_(k+1) + D, D = control_delay
-
-   No effort acts before the first. With T = 0 the law is continuous, and each communication point is a sample of
-   the sensors. */
-#include "integrator.h"
-
+/* Sampled control by the equations of plant/sampling.py. Without a control_period the law is continuous, and each
+   communication point is a sample of the sensors. */
 #include <math.h>
 #include <string.h>
 

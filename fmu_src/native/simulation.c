@@ -2,9 +2,7 @@
 #include <math.h>
 #include <stdio.h>
 
-#include "dormand_prince.h"
 #include "instance.h"
-#include "integrator.h"
 
 static const double TIME_TOLERANCE = 1e-9;
 

@@ -1,10 +1,5 @@
-/* Joint-limit stops and friction; the rules are those of plant/stops.py. A stop without reaction is a clamp: a joint
-   rests while its own acceleration points into the limit. A rigid stop acts on all joints, as friction F does. With the
-   unit vectors E of joints at a limit, which point into the range, and the efforts λ on joints at rest,
-
-       v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0                       at an impact
-       q̈ = q̈_free + M⁻¹λ,        −F ≤ λ ≤ F, at a limit into the range without an upper bound;
-                                 q̈ > 0 only at the lower bound, q̈ < 0 only at the upper one
+/* Joint-limit stops and friction by the equations of plant/stops.py. A stop without reaction is a clamp: a joint rests
+   while its own acceleration points into the limit. A rigid stop acts on all joints, as friction does.
 
    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5; Pfeiffer & Glocker,
    "Multibody Dynamics with Unilateral Contacts", 1996, chapter 5. */
@@ -18,6 +13,66 @@ enum { MOST_PIVOTS = 10000, BLOCK_TRIES = 5 };
 /* 2⁻⁴⁰: rounding error of a sum whose sign decides, relative to its terms. */
 static const double ROUNDING_OF_SUM = 1.0 / 1099511627776.0;
 static const double USUAL_RTOL = 1e-3;
+
+/* The directions of slip in a regime; NULL if no joint slips. */
+INTERNAL const int *slip_of(const Stops *stops)
+{
+    return stops->any_slip ? stops->slip : NULL;
+}
+
+/* True if a joint is nearer to its upper limit than to its lower one. */
+INTERNAL int is_above(const Plant *plant, double q, int i)
+{
+    return RE(plant->value[Q_MAX + i] - q) <= RE(q - plant->value[Q_MIN + i]);
+}
+
+/* Hold joints by reactions, so that their accelerations are 0. */
+static int reacts(const Stops *stops, int i)
+{
+    return stops->held[i] == STUCK || stops->held[i] == STOPPED;
+}
+
+#ifndef IS_COMPLEX
+static int any_reacts(const Stops *stops)
+{
+    int any = 0;
+    for (int i = 0; i < N_JOINTS && stops->any_held; i++)
+        any |= reacts(stops, i);
+    return any;
+}
+
+static void add_reactions(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
+                          double a[N_JOINTS], double reaction[N_JOINTS])
+{
+    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS];
+    for (int i = 0; i < N_JOINTS; i++) {
+        free[i] = reacts(stops, i) ? 0.0 : 1.0;
+        given[i] = reacts(stops, i) ? -a[i] : 0.0;
+    }
+    hybrid_motion(plant, q, &plant->value[ARMATURE], free, given, change, reaction);
+    for (int i = 0; i < N_JOINTS; i++)
+        a[i] += change[i];
+}
+#endif
+
+/* Hold joints, so that their acceleration a is 0; effort receives the holding efforts, for a clamp −q̈. */
+INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], double a[N_JOINTS],
+                       double effort[N_JOINTS])
+{
+    if (!stops->any_held)
+        return;
+#ifndef IS_COMPLEX
+    if (any_reacts(stops))
+        add_reactions(plant, stops, q, a, effort);
+#else
+    (void)plant, (void)q; /* derivatives with reactions are those of the Jacobian */
+#endif
+    for (int i = 0; i < N_JOINTS; i++)
+        if (stops->held[i]) {
+            effort[i] = reacts(stops, i) ? effort[i] : -a[i];
+            a[i] = 0.0;
+        }
+}
 
 #ifndef IS_COMPLEX
 /* A joint at a limit or at rest. */
@@ -110,12 +165,16 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
     return !bounded || (finite && (!any || count == 0));
 }
 
-double coarseness(const Plant *plant)
+/* Fraction of the times within which events at rigid stops are one: they shrink with rtol below its default. */
+static double coarseness(const Plant *plant)
 {
     return fmin(1.0, plant->value[RTOL] / USUAL_RTOL);
 }
 
-int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
+/* Remove the velocity that points into a limit from the state y = (q, v). Joints in anti_chatter stop in both
+   directions; without them, mutual impacts could repeat without end in finite time (Zeno), as those of the feet of a
+   rocking block. Returns whether a velocity pointed into a limit. */
+static int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
 {
     Contact contact[N_JOINTS];
     double impulse[N_JOINTS], *v = y + N_JOINTS;
@@ -201,8 +260,12 @@ static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *
         a[i] += change[i];
 }
 
-void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
-                 Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
+/* Find the regime at y after an impact, with the given rank of J⁺. a receives q̈ in this regime, effort the result of
+   restrain, margin that of acceleration. Resting joints in kept stay at rest even if the holding effort exceeds its
+   bounds. Joints whose motion friction or a rigid stop ends within a window, s, stop at once: the window is that of an
+   impact, and otherwise 0. */
+static void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
+                        Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
     const double *v = y + N_JOINTS;
@@ -250,7 +313,9 @@ void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS
     restrain(plant, stops, y, a, effort);
 }
 
-double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side)
+/* Distance of a joint's holding effort from its lower (side −1) or upper (side 1) bound; HUGE_VAL without a bound. A
+   watched joint is released if one is negative. */
+static double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side)
 {
     const double friction = stops->held[i] == CLAMPED ? 0.0 : plant->value[FRICTION + i];
     if (stops->held[i] != STUCK && is_above(plant, q, i) == (side < 0))
@@ -258,7 +323,8 @@ double grip(const Plant *plant, const Stops *stops, int i, double q, double effo
     return friction - side * effort;
 }
 
-double rounding_of(const Stops *stops, const double effort[N_JOINTS])
+/* Bound on the rounding error of the holding efforts. */
+static double rounding_of(const Stops *stops, const double effort[N_JOINTS])
 {
     double largest = 0.0;
     for (int i = 0; i < N_JOINTS; i++)
@@ -267,64 +333,8 @@ double rounding_of(const Stops *stops, const double effort[N_JOINTS])
 }
 #endif
 
-const int *slip_of(const Stops *stops)
-{
-    return stops->any_slip ? stops->slip : NULL;
-}
-
-int is_above(const Plant *plant, double q, int i)
-{
-    return RE(plant->value[Q_MAX + i] - q) <= RE(q - plant->value[Q_MIN + i]);
-}
-
-/* Hold joints by reactions, so that their accelerations are 0. */
-static int reacts(const Stops *stops, int i)
-{
-    return stops->held[i] == STUCK || stops->held[i] == STOPPED;
-}
-
-#ifndef IS_COMPLEX
-static int any_reacts(const Stops *stops)
-{
-    int any = 0;
-    for (int i = 0; i < N_JOINTS && stops->any_held; i++)
-        any |= reacts(stops, i);
-    return any;
-}
-
-static void add_reactions(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
-                          double a[N_JOINTS], double reaction[N_JOINTS])
-{
-    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS];
-    for (int i = 0; i < N_JOINTS; i++) {
-        free[i] = reacts(stops, i) ? 0.0 : 1.0;
-        given[i] = reacts(stops, i) ? -a[i] : 0.0;
-    }
-    hybrid_motion(plant, q, &plant->value[ARMATURE], free, given, change, reaction);
-    for (int i = 0; i < N_JOINTS; i++)
-        a[i] += change[i];
-}
-#endif
-
-void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], double a[N_JOINTS],
-              double effort[N_JOINTS])
-{
-    if (!stops->any_held)
-        return;
-#ifndef IS_COMPLEX
-    if (any_reacts(stops))
-        add_reactions(plant, stops, q, a, effort);
-#else
-    (void)plant, (void)q; /* derivatives with reactions are those of the Jacobian */
-#endif
-    for (int i = 0; i < N_JOINTS; i++)
-        if (stops->held[i]) {
-            effort[i] = reacts(stops, i) ? effort[i] : -a[i];
-            a[i] = 0.0;
-        }
-}
-
-void compute_rates(Plant *plant, const Stops *stops)
+/* Compute the derivatives of the plant's state, with joints at rest held. */
+INTERNAL void compute_rates(Plant *plant, const Stops *stops)
 {
     double *value = plant->value, effort[N_JOINTS];
     memcpy(&value[DER_Q], &value[V], N_JOINTS * sizeof *value);
