@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..plant.robot import Robot
+from .inertials import model_with
 from .parameters import Dynamics
 from .prediction import Prediction, deviation, predict
 from .stretches import Array, Stretch
@@ -89,10 +90,7 @@ def _curve(robot: Robot, models: Sequence[tuple[Dynamics, float]], stretch: Stre
 
 def efforts(robot: Robot, values: Dynamics, stretch: Stretch) -> Array:
     """Return the efforts, as recorded, N × n, that the inverse dynamics needs for a measured motion."""
-    model = robot.model.copy()
-    model.gravity.linear = values.gravity
-    for body, ten in enumerate(values.inertial.reshape(-1, 10)):
-        model.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
+    model = model_with(robot.model, values.inertial, values.gravity)
     C = np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling
     data = model.createData()
     states = zip((stretch.q + values.offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T)

@@ -33,6 +33,15 @@ def dynamic_parameters(mass: Any, com: Any, second: Any, R: Array, p: Array) -> 
     return np.array([mass, *(mass * c), xx, xy, yy, xz, yz, zz])
 
 
+def model_with(model: pin.Model, inertial: Array, gravity: Array) -> pin.Model:
+    """Return a copy of a model with the dynamic parameters of its bodies, and the gravity, m/s²."""
+    copy = model.copy()
+    copy.gravity.linear = gravity
+    for body, ten in enumerate(inertial.reshape(-1, 10)):
+        copy.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
+    return copy
+
+
 def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], list[pin.SE3], list[pin.Inertia]]:
     """Return the moving links with mass: names, bodies, poses in these, and inertias in the links' frames."""
     names, bodies, places, inertias = [], [], [], []

@@ -30,8 +30,21 @@ from ..plant.urdf import Urdf
 from .inertials import INERTIA, dynamic_parameters, inertia_of, moving_links, second_moments
 
 Array = NDArray[np.float64]
-OF_JOINTS = ("friction", "damping", "armature", "offset", "gain")
+OF_JOINTS = {
+    "friction": ("N.m", "N"),
+    "damping": ("N.m.s/rad", "N.s/m"),
+    "armature": ("kg.m2", "kg"),
+    "offset": ("rad", "m"),
+    "gain": ("", ""),
+}
+"""Units of rotating and of sliding joints."""
 OF_THE_ROBOT = ("payload", "payload_com", "gravity")
+EXPONENTS, BOUNDED = ("mass", "gain"), ("friction", "damping", "armature", "payload")
+"""Groups of values exp(x), and groups of values that are at least 0."""
+SIZES = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}
+"""Number of coordinates, where it is not 1."""
+SCALES = {"mass": 1.0, "gain": 1.0, "gravity": 0.5, "com": 0.1, "payload_com": 0.1, "offset": 0.2}
+"""Scales of coordinates that do not depend on the robot: deviations so large that the coordinate would be unknown."""
 ROWS, COLUMNS = np.tril_indices(3)
 LEAST_MOMENT = 1e-3  # fraction of m·(5 cm)²: smallest initial second moments of mass of a free inertia
 LEAST_PAYLOAD = 0.01  # fraction of the moving mass: smallest initial payload if its position is free
@@ -98,6 +111,16 @@ class Free(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
 
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return SIZES.get(self.group, 1)
+
+    def of(self, values: Values) -> Any:
+        """Return a view of its values; for an inertia, of the second moments of mass."""
+        whole = getattr(values, "second" if self.group == "inertia" else self.group)
+        return whole if self.group in OF_THE_ROBOT else whole[self.place, ...]
+
 
 class Parameters:
     """The free parameters of a robot: their names, and the map from coordinates to values.
@@ -158,23 +181,15 @@ class Parameters:
         self._settle()
         self.names = tuple(name for free in self.free for name in free.names)
         self.units = tuple(unit for free in self.free for unit in free.units)
-        sizes = {"gravity": 2, "com": 3, "payload_com": 3, "inertia": 6}
-        self.coordinate_names = tuple(_of_all(free) for free in self.free for _ in range(sizes.get(free.group, 1)))
+        self.coordinate_names = tuple(_of_all(free) for free in self.free for _ in range(free.size))
 
     def _known(self) -> list[tuple[str, Free]]:
         """Return all parameters: the name that a pattern matches, and the parameters."""
         known = []
-        for group in OF_JOINTS:
+        for group, units in OF_JOINTS.items():
             for i, (joint, slides) in enumerate(zip(self.robot.joints, self.robot.prismatic)):
                 name = f"{group}:{joint}" if group in ("offset", "gain") else f"{group}[{i + 1}]"
-                units = {
-                    "friction": ("N.m", "N"),
-                    "damping": ("N.m.s/rad", "N.s/m"),
-                    "armature": ("kg.m2", "kg"),
-                    "offset": ("rad", "m"),
-                    "gain": ("", ""),
-                }
-                known.append((name, Free(group, i, (name,), (units[group][slides],))))
+                known.append((name, Free(group, i, (name,), (units[slides],))))
         for i, link in enumerate(self.links):
             com = tuple(f"com:{link}.{axis}" for axis in "xyz")
             inertia = tuple(f"inertia:{link}.{key}" for key in INERTIA)
@@ -209,86 +224,56 @@ class Parameters:
         x: list[float] = []
         low: list[float] = []
         for free in self.free:
-            value = getattr(self.start, "second" if free.group == "inertia" else free.group)[free.place]
-            if free.group in ("mass", "gain"):
-                own = [np.log(value)]
+            own = np.ravel(free.of(self.start)).tolist()
+            if free.group in EXPONENTS:
+                own = np.log(own).tolist()
             elif free.group == "inertia":
-                factor = np.linalg.cholesky(value)
+                factor = np.linalg.cholesky(free.of(self.start))
                 factor[range(3), range(3)] = np.log(np.diag(factor))
                 own = factor[ROWS, COLUMNS].tolist()
             elif free.group == "gravity":
                 own = [0.0, 0.0]
-            elif free.group in ("com", "payload_com"):
-                own = list(getattr(self.start, free.group).reshape(-1, 3)[free.place])
-            else:
-                own = [value]
             x += own
-            bounded = free.group in ("friction", "damping", "armature", "payload")
-            low += [0.0 if bounded else -inf] * len(own)
-        return np.array(x), np.array(low), self._scales(typical)
+            low += [0.0 if free.group in BOUNDED else -inf] * free.size
+        return np.array(x), np.array(low), np.concatenate([self._scale(free, typical) for free in self.free])
 
-    def _scales(self, typical: Mapping[str, Array]) -> Array:
-        """Return the scale of each coordinate: a deviation so large that the coordinate would be unknown."""
-        moving = float(self.start.mass.sum())
-        scales: list[float] = []
-        for free in self.free:
-            if free.group in ("mass", "gain"):
-                scales.append(1.0)
-            elif free.group == "inertia":
-                factor = np.sqrt(np.trace(self.start.second[free.place]))
-                scales += [1.0 if row == column else factor for row, column in zip(ROWS, COLUMNS)]
-            elif free.group == "payload":
-                scales.append(moving)
-            elif free.group == "gravity":
-                scales += [0.5, 0.5]
-            elif free.group in ("com", "payload_com"):
-                scales += [0.1] * 3
-            elif free.group == "offset":
-                scales.append(0.2)
-            else:
-                scales.append(float(typical[free.group][free.place]))
-        return np.array(scales)
+    def _scale(self, free: Free, typical: Mapping[str, Array]) -> Array:
+        """Return the scale of each coordinate of a parameter."""
+        if free.group == "inertia":
+            return np.where(ROWS == COLUMNS, 1.0, np.sqrt(np.trace(free.of(self.start))))
+        if free.group == "payload":
+            return np.array([self.start.mass.sum()])
+        own = SCALES[free.group] if free.group in SCALES else typical[free.group][free.place]
+        return np.full(free.size, float(own))
 
     def values(self, x: NDArray[Any]) -> Values:
         """Return the physical values at coordinates, which may be complex for derivatives."""
         values, place = self.start.copy(x.dtype.type), 0
         for free in self.free:
-            size = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}.get(free.group, 1)
-            part, i = x[place : place + size], free.place
-            place += size
-            if free.group in ("mass", "gain"):
-                getattr(values, free.group)[i] = np.exp(part[0])
+            part, own = x[place : place + free.size], free.of(values)
+            place += free.size
+            if free.group in EXPONENTS:
+                own[...] = np.exp(part[0])
             elif free.group == "inertia":
                 factor = np.zeros((3, 3), x.dtype)
                 factor[ROWS, COLUMNS] = part
                 factor[range(3), range(3)] = np.exp(np.diag(factor))
-                values.second[i] = factor @ factor.T
+                own[:] = factor @ factor.T
             elif free.group == "gravity":
                 g = self.start.gravity
                 axes = np.linalg.svd(g[None])[2][1:]
                 length = np.linalg.norm(g)
-                values.gravity[:] = (g + length * (part @ axes)) / np.sqrt(1.0 + part @ part)
-            elif free.group == "payload_com":
-                values.payload_com[:] = part
-            elif free.group == "com":
-                values.com[i] = part
+                own[:] = (g + length * (part @ axes)) / np.sqrt(1.0 + part @ part)
             else:
-                getattr(values, free.group)[i] = part[0]
+                own[...] = part if own.ndim else part[0]
         return values
 
     def reported(self, values: Values) -> NDArray[Any]:
         """Return the values of the named parameters."""
         numbers: list[Any] = []
         for free in self.free:
-            if free.group == "inertia":
-                inertia = inertia_of(values.second[free.place])
-                numbers += [inertia[place] for place in INERTIA.values()]
-            elif free.group == "com":
-                numbers += list(values.com[free.place])
-            elif free.group in ("payload_com", "gravity"):
-                numbers += list(getattr(values, free.group))
-            else:
-                numbers.append(getattr(values, free.group)[free.place])
+            own = free.of(values)
+            numbers += [inertia_of(own)[place] for place in INERTIA.values()] if own.ndim == 2 else [*own.flat]
         return np.array(numbers)
 
     def dynamics(self, values: Values) -> Dynamics:

@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
 from ..plant.plant import DiscardError, Plant
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
 from ..plant.variables import Starts, variable_table
+from .inertials import model_with
 from .parameters import Dynamics
 from .stretches import Array, Stretch
 
@@ -34,9 +34,6 @@ class Prediction(NamedTuple):
 
 def plant_of(robot: Robot, values: Dynamics, step: float) -> Plant:
     """Return the bare plant of a robot with given values of its parameters."""
-    model = robot.model.copy()
-    for body, ten in enumerate(values.inertial.reshape(-1, 10)):
-        model.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
     n = len(robot.joints)
     starts: Starts = {
         "q_start": (0.0,) * n,
@@ -48,7 +45,7 @@ def plant_of(robot: Robot, values: Dynamics, step: float) -> Plant:
         "atol": ATOL,
         "max_step": step,
     }
-    robot = replace(robot, model=model)
+    robot = replace(robot, model=model_with(robot.model, values.inertial, values.gravity))
     return Plant(robot, variable_table(robot, starts, "effort"), "effort")
 
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from ..plant.robot import Robot
+from .inertials import model_with
 from .parameters import Dynamics
 from .stretches import Array, Stretch
 
@@ -164,14 +165,12 @@ def _delayed(stretch: Stretch, delay: float) -> Array:
 
 def position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wanted: bool) -> Array:
     """Return the derivative of the inverse dynamics with respect to positions, N × n × n; 0 if it is not needed."""
-    model = robot.model.copy()
-    model.gravity.linear = values.gravity
-    for body, ten in enumerate(values.inertial.reshape(-1, 10)):
-        model.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
-    data, n = model.createData(), len(robot.joints)
+    n = len(robot.joints)
     out = np.zeros((len(stretch.t), n, n))
     if not wanted:
         return out
+    model = model_with(robot.model, values.inertial, values.gravity)
+    data = model.createData()
     C = np.eye(n) if robot.coupling is None else robot.coupling
     q, v, a = (stretch.q + values.offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T
     for k in range(len(q)):
