@@ -6,7 +6,6 @@ from scipy.integrate import RK45
 
 from twodof.plant import dormand_prince, integrator, regime
 from twodof.plant.equations import Equations
-from twodof.plant.step_error import StepError
 from twodof.plant.stops import Stops
 
 FREE = [(-np.inf, np.inf)]
@@ -277,7 +276,7 @@ def test_a_jump_that_no_rank_explains_is_refused(budget):
     def acceleration(q, v):
         return [-1e4 if q[0] + 0.01 * v[0] > 0.0 else 1e4]
 
-    with pytest.raises(StepError) as refused:
+    with pytest.raises(regime.StepError) as refused:
         advance(smooth(acceleration), [1e-3], [0.0], 0.02, FREE, 1e-6, 1e-9, 1e-3)
     assert refused.value.joint == 0
 
@@ -306,7 +305,7 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_rate(budget):
         calls += 1
         return [-v[0], -1e10 * v[1]]
 
-    with pytest.raises(StepError, match="joint 1 changes at a rate of 1e") as refused:
+    with pytest.raises(regime.StepError, match="joint 1 changes at a rate of 1e") as refused:
         advance(smooth(acceleration), [0.0] * 2, [0.0, 1.0], 0.01, FREE * 2, 1e-3, 1e-6, 1e-3)
     assert (refused.value.joint, refused.value.too_fine) == (1, False)
     assert refused.value.rate == pytest.approx(1e10, rel=1e-6)
@@ -314,7 +313,7 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_rate(budget):
 
 
 def test_a_joint_that_answers_to_its_position_is_named_by_the_root_of_it(budget):
-    with pytest.raises(StepError) as refused:
+    with pytest.raises(regime.StepError) as refused:
         advance(
             smooth(lambda q, v: [-1e18 * q[0], -1e8 * v[1]]), [1.0, 0.0], [0.0, 1.0], 0.01, FREE * 2, 1e-3, 1e-6, 1e-3
         )

@@ -22,10 +22,9 @@ from .dormand_prince import STAGES
 from .equations import Answer, Array, Equations, Law, Response
 from .mechanism import Mechanism
 from .orientation import quaternion
-from .regime import BUDGET
+from .regime import BUDGET, StepError
 from .robot import Robot
 from .sampling import Sampling, advance_sampled, sampling_refusal
-from .step_error import StepError
 from .stops import Stops
 from .variables import CONTROLS, RANGES, Variable
 

@@ -13,7 +13,7 @@ that their errors would add up to energy.
 """
 
 from collections.abc import Callable, Sequence
-from itertools import chain
+from itertools import chain, product
 from math import inf, isfinite, isnan, nan, ulp
 from struct import Struct
 
@@ -24,7 +24,6 @@ from .dormand_prince import HEUN, Array, P, State, dormand_prince, error_norm, h
 from .equations import Equations
 from .pseudo_inverse import rank_margin
 from .rosenbrock import CUBIC, damping_limits, rosenbrock
-from .step_error import StepError, fastest_joint
 from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
@@ -36,6 +35,39 @@ BUDGET = 2_000_000
 """Most evaluations of the right-hand side in one communication step; only a stiff motion would need more."""
 MOST_ROWS = 6
 """Largest number of rows of a task Jacobian: three axes, and three for an orientation."""
+NUDGE = 1e-6  # step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s
+
+
+class StepError(ArithmeticError):
+    """A communication step that fails the tolerances or exceeds the budget.
+
+    Attributes:
+        too_fine: whether even the smallest integration step failed, so that a larger budget would not help.
+        joint: index of the joint that changes fastest.
+        rate: the joint's rate of change, 1/s.
+    """
+
+    def __init__(self, *, too_fine: bool, joint: int, rate: float) -> None:
+        super().__init__(f"joint {joint} changes at a rate of {rate:g} 1/s")
+        self.too_fine, self.joint, self.rate = too_fine, joint, rate
+
+
+def fastest_joint(acceleration: Callable[[list[float]], Sequence[float]], y: list[float]) -> tuple[int, float]:
+    """Return the joint whose acceleration is most sensitive to its own state, and its rate of change, 1/s.
+
+    Args:
+        acceleration: q̈ at a state (q, v).
+        y: the state.
+    """
+    n, a = len(y) // 2, acceleration(y)
+    rates = []
+    for i, order in product(range(n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
+        nudged = y.copy()
+        nudged[i + n * (order == 1)] += NUDGE
+        change = abs(acceleration(nudged)[i] - a[i]) / NUDGE
+        rates.append((change ** (1 / order) if isfinite(change) else inf, i))
+    rate, joint = max(rates)
+    return joint, rate
 
 
 class Motion:
