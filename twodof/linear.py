@@ -170,7 +170,12 @@ class _Point:
         self._q, self._v = fmu.vector("q"), fmu.vector("v")
         self._starts = fmu.vector("q_start"), fmu.vector("v_start")
         self._accelerations = [f"der({name})" for name in self._v]
-        self._instance.initialise(0.0, np.inf, self._values)
+        self._begin()
+
+    def _begin(self, **others: Value) -> None:
+        """Reset the instance to the point's values, of which some may be replaced for once."""
+        self._instance.reset()
+        self._instance.initialise(0.0, np.inf, {**self._values, **others})
 
     def _read(self, names: Sequence[str]) -> Array:
         return np.array(self._instance.reader(names)())
@@ -179,8 +184,7 @@ class _Point:
         q = np.clip(q, *(self._read(self._fmu.vector(name)) for name in ("q_min", "q_max")))
         still = dict.fromkeys(self._starts[1], 0.0)
         self._values.update({**dict(zip(self._starts[0], q.tolist())), **still})
-        self._instance.reset()
-        self._instance.initialise(0.0, np.inf, self._values)
+        self._begin()
 
     def settle(self) -> None:
         """Move to an equilibrium, by Newton's method with halved steps."""
@@ -206,8 +210,7 @@ class _Point:
     def hold_effort(self, period: float) -> None:
         """Sample the controller at the present state, so that its effort is held."""
         self._values["control_period"] = period
-        self._instance.reset()
-        self._instance.initialise(0.0, np.inf, self._values)
+        self._begin()
 
     def model(self, inputs: list[str], outputs: list[str]) -> LinearModel:
         """Return the linear model at the point."""
@@ -291,11 +294,9 @@ class _Point:
         """Return notes on saturated joints; raise if an effort is exactly at its limit."""
         if not {**self._fmu.start_values, **self._values}.get("limit_effort"):
             return []
-        self._instance.reset()
-        self._instance.initialise(0.0, np.inf, {**self._values, "limit_effort": False})
+        self._begin(limit_effort=False)
         efforts = self._read(self._fmu.vector("tau"))
-        self._instance.reset()
-        self._instance.initialise(0.0, np.inf, self._values)
+        self._begin()
         remarks = []
         for joint, tau, limit in zip(
             self._fmu.joints, efforts, limits_of(robot_of(self._fmu.urdf), self._fmu.joints).effort

@@ -78,33 +78,30 @@ class Store:
             BagError: the bag cannot be written, or has samples already.
         """
         with self._turn:
-            self._enter(part)
-
-    def _enter(self, part: Part) -> None:
-        if self._begun if self._entered else self._names and part.namespace not in self._names:
-            raise BagError(f"the bag '{self.path}' is being written and accepts no further robot")
-        names = [part.namespace for part in (*self._parts, part)]
-        if len(names) > len(set(names)) or ("" in names and len(names) > 1):
-            raise BagError(f"the robots of the bag '{self.path}' need namespaces that differ")
-        try:
-            if not self._entered:
-                self._old = OldBag(self.path, overwrite=self._overwrite)
-                self._create()
+            if self._begun if self._entered else self._names and part.namespace not in self._names:
+                raise BagError(f"the bag '{self.path}' is being written and accepts no further robot")
+            names = [part.namespace for part in (*self._parts, part)]
+            if len(names) > len(set(names)) or ("" in names and len(names) > 1):
+                raise BagError(f"the robots of the bag '{self.path}' need namespaces that differ")
             try:
-                part.open()
-                self.writer.flush()
-                if self.fsync:
-                    sync(self.path, self.path.absolute().parent)
-            except BaseException:
                 if not self._entered:
-                    self._remove()
-                raise
-        except WriterError as error:  # another process has made the folder meanwhile
-            raise BagError(f"cannot write the bag '{self.path}': {error}") from error
-        except (OSError, sqlite3.Error) as error:
-            raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
-        self._parts.append(part)
-        self._entered += 1
+                    self._old = OldBag(self.path, overwrite=self._overwrite)
+                    self._create()
+                try:
+                    part.open()
+                    self.writer.flush()
+                    if self.fsync:
+                        sync(self.path, self.path.absolute().parent)
+                except BaseException:
+                    if not self._entered:
+                        self._remove()
+                    raise
+            except WriterError as error:  # another process has made the folder meanwhile
+                raise BagError(f"cannot write the bag '{self.path}': {error}") from error
+            except (OSError, sqlite3.Error) as error:
+                raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
+            self._parts.append(part)
+            self._entered += 1
 
     def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
         """Add topics; return the numbers of their connections, in the same order."""

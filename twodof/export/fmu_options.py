@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..errors import BuildError, choice
 from ..plant.variables import CONTROLS, FREE, ON_REQUEST
 
 DEFAULT_NAME = "TwoDof"
+OF_THE_FLAVOUR = ("mesh_dir", "meshes", "link_environment", "native", "fmi", "arrays", "platforms", "reference")
+"""Options that do not change the model."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +108,7 @@ class FmuOptions:
     @property
     def is_default_arm(self) -> bool:
         """True for the shipped arm with its default settings, in any flavour."""
-        model = (
-            "urdf",
-            "frame",
-            "lock",
-            "axes",
-            "gravity",
-            "q_start",
-            "control",
-            "outputs",
-            "free",
-            "settings",
-            "part",
-            "name",
-        )
-        return all(getattr(self, key) == getattr(FmuOptions(), key) for key in model)
+        return self == replace(FmuOptions(), **{key: getattr(self, key) for key in OF_THE_FLAVOUR})
 
 
 def identifier(robot: str | Path) -> str:

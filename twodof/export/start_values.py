@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from itertools import chain, count, takewhile
 from math import inf, isfinite
-from typing import Protocol
+from typing import Any, Protocol
 
 from ..errors import InputError, choice, nearest
 from ..plant.variables import CONTROLS, Value
@@ -14,24 +14,12 @@ Setting = object
 LIMIT_OF_INTEGERS = 2**31
 
 
-class Settable(Protocol):
-    """Interface of a variable: causality and type."""
-
-    @property
-    def causality(self) -> str:
-        """Causality, as FMI has it."""
-
-    @property
-    def type(self) -> str:
-        """The type: "Real", "Integer", "Boolean" or another."""
-
-
 class Variables(Protocol):
-    """The variables of an FMU by name, and the name of its control law."""
+    """The variables of an FMU or of a build."""
 
     @property
-    def variables(self) -> Mapping[str, Settable]:
-        """All variables, in order."""
+    def variables(self) -> Mapping[str, Any]:
+        """All variables by name, in order; each has a ``causality`` and a ``type``, as FMI has them."""
 
     @property
     def control(self) -> str:
@@ -42,7 +30,7 @@ class Variables(Protocol):
         """Further names, and the names that they stand for."""
 
 
-def vector(variables: Mapping[str, Settable], group: str) -> list[str]:
+def vector(variables: Mapping[str, Any], group: str) -> list[str]:
     """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
     if group in variables:
         return [group]
@@ -50,7 +38,7 @@ def vector(variables: Mapping[str, Settable], group: str) -> list[str]:
     return list(takewhile(variables.__contains__, names))
 
 
-def groups_of(variables: Mapping[str, Settable], causality: str) -> dict[str, list[str]]:
+def groups_of(variables: Mapping[str, Any], causality: str) -> dict[str, list[str]]:
     """Return vectors and scalars of one causality by group name."""
     groups: dict[str, list[str]] = {}
     for name, variable in variables.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from math import inf
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,12 @@ def _starts(fmu: Fmu, reference: Reference) -> Values:
     return {name: KINDS[fmu.variables[name].type](value) for name, value in values.items()}
 
 
+def _by_type(fmu: Fmu, *functions: Callable[..., Any]) -> Callable[[str], Callable[..., Any]]:
+    """Return a choice, by a variable's name, among functions for the types in KINDS."""
+    own = dict(zip(KINDS, functions))
+    return lambda name: own[fmu.variables[name].type]
+
+
 def in_fmpy(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     """Run the stimuli by FMPy's simulate_fmu."""
     from fmpy import simulate_fmu
@@ -66,28 +73,23 @@ def in_libcosim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
     execution = CosimExecution.from_step_size(round(reference.step * NANOSECONDS))
     slave = execution.add_local_slave(CosimLocalSlave(str(fmu.path), "fmu"))
-    setters = {
-        "Real": execution.real_initial_value,
-        "Integer": execution.integer_initial_value,
-        "Boolean": execution.boolean_initial_value,
-    }
-    for name, value in _starts(fmu, reference).items():
-        setters[fmu.variables[name].type](slave, fmu.variables[name].reference, value)
     observer, inputs = CosimObserver.create_last_value(), CosimManipulator.create_override()
     execution.add_observer(observer)
     execution.add_manipulator(inputs)
-    writers = inputs.slave_real_values, inputs.slave_integer_values, inputs.slave_boolean_values
-    readers = observer.last_real_values, observer.last_integer_values, observer.last_boolean_values
-    write, read = (dict(zip(KINDS, functions)) for functions in (writers, readers))
+    start = _by_type(
+        fmu, execution.real_initial_value, execution.integer_initial_value, execution.boolean_initial_value
+    )
+    write = _by_type(fmu, inputs.slave_real_values, inputs.slave_integer_values, inputs.slave_boolean_values)
+    read = _by_type(fmu, observer.last_real_values, observer.last_integer_values, observer.last_boolean_values)
+    for name, value in _starts(fmu, reference).items():
+        start(name)(slave, fmu.variables[name].reference, value)
 
     def change(values: Values) -> None:
         for name, value in values.items():
-            variable = fmu.variables[name]
-            write[variable.type](slave, [variable.reference], [value])
+            write(name)(slave, [fmu.variables[name].reference], [value])
 
     def read_all() -> list[float]:
-        variables = [fmu.variables[name] for name in names]
-        return [read[variable.type](slave, [variable.reference])[0] for variable in variables]
+        return [read(name)(slave, [fmu.variables[name].reference])[0] for name in names]
 
     return reference.rows(change, lambda t, h: execution.step(1), read_all)
 
@@ -101,17 +103,17 @@ def in_ecos(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
         structure.add_parameter_set("start", {f"fmu::{name}": v for name, v in _starts(fmu, reference).items()})
         with EcosSimulation(step_size=reference.step, structure=structure) as simulation:
             simulation.init(start_time=reference.start, parameter_set="start")
-            setters = dict(zip(KINDS, (simulation.set_real, simulation.set_integer, simulation.set_bool)))
-            getters = dict(zip(KINDS, (simulation.get_real, simulation.get_integer, simulation.get_bool)))
+            write = _by_type(fmu, simulation.set_real, simulation.set_integer, simulation.set_bool)
+            read = _by_type(fmu, simulation.get_real, simulation.get_integer, simulation.get_bool)
 
             def change(values: Values) -> None:
                 for name, value in values.items():
-                    setters[fmu.variables[name].type](f"fmu::{name}", value)
+                    write(name)(f"fmu::{name}", value)
 
-            def read() -> list[float]:
-                return [getters[fmu.variables[name].type](f"fmu::{name}") for name in names]
+            def read_all() -> list[float]:
+                return [read(name)(f"fmu::{name}") for name in names]
 
-            return reference.rows(change, lambda t, h: simulation.step(1), read)
+            return reference.rows(change, lambda t, h: simulation.step(1), read_all)
 
 
 def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
@@ -120,23 +122,21 @@ def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
     slave = Fmi2Slave(str(fmu.path), model_identifier=fmu.description.coSimulation.modelIdentifier)
     slave.instantiate("fmu", Fmi2Type.CO_SIMULATION, guid=fmu.guid)
-    setters = dict(zip(KINDS, (slave.set_real, slave.set_integer, slave.set_boolean)))
-    getters = dict(zip(KINDS, (slave.get_real, slave.get_integer, slave.get_boolean)))
+    write = _by_type(fmu, slave.set_real, slave.set_integer, slave.set_boolean)
+    read = _by_type(fmu, slave.get_real, slave.get_integer, slave.get_boolean)
 
     def change(values: Values) -> None:
         for name, value in values.items():
-            setters[fmu.variables[name].type]([fmu.variables[name].reference], [value])
+            write(name)([fmu.variables[name].reference], [value])
+
+    def read_all() -> list[float]:
+        return [read(name)([fmu.variables[name].reference])[0] for name in names]
 
     change(_starts(fmu, reference))
     slave.setup_experiment(start_time=reference.start)
     slave.enter_initialization_mode()
     slave.exit_initialization_mode()
-
-    def read() -> list[float]:
-        variables = [fmu.variables[name] for name in names]
-        return [getters[variable.type]([variable.reference])[0] for variable in variables]
-
-    rows = reference.rows(change, slave.do_step, read)
+    rows = reference.rows(change, slave.do_step, read_all)
     slave.free_instance()
     return rows
 
