@@ -4,24 +4,11 @@ from collections.abc import Sequence
 
 from ..bag.recording import Recording
 from ..plant.urdf import UNBOUNDED
+from ..plant.variables import ROWS
 
-UNITS = {
-    "x_des": "m",
-    "xd_des": "m/s",
-    "xdd_des": "m/s²",
-    "Kp": "s⁻²",
-    "Kd": "s⁻¹",
-    "Kn": "s⁻¹",
-    "omega_des": "rad/s",
-    "alpha_des": "rad/s²",
-    "Kp_rot": "s⁻²",
-    "Kd_rot": "s⁻¹",
-    "gravity": "m/s²",
-    "max_step": "s",
-    "payload": "kg",
-    "payload_com": "m",
-    "f_ext": "N",
-}
+WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "rad/s2": "rad/s²"}
+"""FMI units in the spelling of figures."""
+UNITS = {group: WRITTEN.get(unit, unit) for group, _, _, unit, *_ in ROWS if unit and "|" not in unit}
 """Units of variables that do not depend on the joint."""
 
 

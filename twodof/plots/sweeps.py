@@ -20,6 +20,7 @@ from ..export.closed_form import Array
 from ..sweeps.ranking import METRICS, ROUNDING, USE, beyond_limits, candidates, ranked, ranks, remark
 from .figure import Drawing, draw_head, html_of
 from .maps import map_page
+from .settings import WRITTEN
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR, Style
 
 # isort: split
@@ -39,8 +40,6 @@ PAIRED = ("settling_time", "overshoot", "peak_effort")
 """Metrics that are drawn for pairs of variables: speed, and its cost in precision and effort."""
 MOST_PAIRS = 10
 WIDTH, HEIGHT = 3.2, 2.5  # inches, of a panel with axes and colour bar
-WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "rad/s2": "rad/s²"}
-"""FMI units in the spelling of figures."""
 WIDE = 10.0  # ratio of largest to smallest value from which on colours are logarithmic
 BEST: Style = dict(marker="*", s=90, color=COLOURS[1], edgecolors="white", linewidths=0.7)
 BEYOND: Style = dict(marker="X", s=10, color=INK, edgecolors="white", linewidths=0.4)
