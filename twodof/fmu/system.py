@@ -29,8 +29,8 @@ class System(Fmu):
     causality "local".
 
     Attributes:
-        title: the system's name.
-        digest: SHA-256 of its structure and its FMUs' digests.
+        description: that of the robot's FMU, with the system's name, default experiment, and as GUID the SHA-256 of its
+            structure and its FMUs' digests.
         components: FMUs by full name.
         links: connections of components' variables with their first sources.
         batches: outputs and inputs in the order of evaluation at one instant.
@@ -40,8 +40,6 @@ class System(Fmu):
         bound: start values of components' variables from parameter bindings, also of connectors that pass them.
     """
 
-    title: str = ""
-    digest: str = ""
     recorded: str = ""
     components: Mapping[str, Fmu] = field(default_factory=dict)
     links: tuple[Link, ...] = ()
@@ -52,16 +50,6 @@ class System(Fmu):
 
     def __repr__(self) -> str:
         return f"<System '{self.path}': {', '.join(self.components)}; joints {', '.join(self.joints)}>"
-
-    @property
-    def name(self) -> str:
-        """The system's name."""
-        return self.title
-
-    @property
-    def guid(self) -> str:
-        """Digest of the structure and of the FMUs' digests."""
-        return self.digest
 
     def remarks(self, asked: Iterable[str] = ()) -> list[str]:
         """Return lines about vectors that are connected in part, and settings that another FMU has too."""
@@ -147,7 +135,7 @@ def load_system(path: Path, robot: str = "") -> System:
         digest.update(fmu.guid.encode() + b"\0")
     own: dict[str, Any] = {each.name: getattr(fmus[chosen], each.name) for each in fields(Fmu)}
     description = copy(fmus[chosen].description)
-    description.defaultExperiment = times
+    description.modelName, description.guid, description.defaultExperiment = title, digest.hexdigest(), times
     aliases: dict[str, str] = {}
     for name, node in places.items():
         if (full := str(node)) != name:
@@ -155,9 +143,7 @@ def load_system(path: Path, robot: str = "") -> System:
     own |= dict(variables=variables, description=description, control="", aliases=aliases)
     return System(
         **own,
-        title=title,
         recorded=chosen,
-        digest=digest.hexdigest(),
         components=fmus,
         links=tuple(links),
         batches=batches,
