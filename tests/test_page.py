@@ -421,14 +421,19 @@ def test_the_url_has_the_settings(browser, arm, page) -> None:
     page.evaluate("() => { arm.set('Kp', [80, 60]); arm.set('x_des[2]', -0.1); arm.set('limit_effort', true); }")
     expected = "#x_des=0.2,-0.1&Kp=80,60&limit_effort=true"
     until(page, lambda found: sorted(found[1:].split("&")) == sorted(expected[1:].split("&")), fragment)
-    for part, said_of in ((expected, ""), ("#Kp=1,2,3", "Kp has 2 elements"), ("#Kq=1", "there is no variable 'Kq'")):
+    start = [50, 50, 0.2, 0.05, False]
+    for part, said_of, held in (
+        (expected, "", [80, 60, 0.2, -0.1, True]),
+        ("#Kp=30", "", [30, 30, *start[2:]]),
+        ("#Kp=1,2,3", "Kp has 2 elements", start),
+        ("#Kq=1", "there is no variable 'Kq'", start),
+    ):
         with browser.new_context(viewport=VIEWPORT, offline=True) as context:
             other = context.new_page()
             other.goto(arm.as_uri() + part)
             other.wait_for_selector(READY)
             values = other.evaluate("[...arm.held('Kp'), ...arm.held('x_des'), arm.values.get('limit_effort')]")
-            assert values == ([50, 50, 0.2, 0.05, False] if said_of else [80, 60, 0.2, -0.1, True])
-            assert said_of in said(other)
+            assert values == held and said_of in said(other)
     page.evaluate("arm.startAgain(true)")
     until(page, lambda found: found == "", fragment)
 

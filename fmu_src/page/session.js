@@ -53,8 +53,9 @@ export class Session extends Samples {
     this.values = this.defaults();
     try {
       const pairs = decodeURIComponent(state).split("&").filter(Boolean).flatMap((part) => {
-        const [group, ...values] = part.split(/[=,]/);
-        return this.checked(group, /** @type {any} */ (values.map((text) => (text === "true" || text === "false" ? text === "true" : Number(text || NaN)))));
+        const [group, ...texts] = part.split(/[=,]/);
+        const values = texts.map((text) => (text === "true" || text === "false" ? text === "true" : Number(text || NaN)));
+        return this.checked(group, /** @type {any} */ (values.length === 1 ? values[0] : values));
       });
       this.values = new Map([...this.values, ...pairs]);
       this.startAgain();
