@@ -14,7 +14,7 @@ from .judge import OF_THE_END, Judge
 from .setup import OF_THE_CONTROLLER
 
 LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
-WHOLE = 0.9  # part of the error whose removal leaves nothing to explain
+WHOLE = 0.9  # part of the error whose removal explains all consequences
 TURN = 6.0  # rad: larger joint targets are in degrees, if one is
 SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
 
@@ -67,7 +67,7 @@ def by_removal(
         counted = [_counted(cause, most) for cause in tried if cause.removes is None or abs(cause.removes) >= SMALL]
         tried = sorted(counted, key=lambda cause: _rank(cause, left))
     root = plans.get(tried[0].text) if tried else None
-    if root is None or root not in results or most > WHOLE:
+    if root is None or root not in results:
         return tuple(tried)
     known = {(cause.kind, cause.joint, cause.subject) for cause in tried}
     rest = [c for c in causes_of(results[root]) if not c.noted and (c.kind, c.joint, c.subject) not in known]

@@ -241,8 +241,9 @@ def _signals(judge: Judge) -> tuple[Array, Array, float]:
 
 
 def _causes_of(judge: Judge) -> tuple[Cause, ...]:
-    """Return the causes of a repeated run."""
-    return causes(judge, _missed(judge), motion_of(*_signals(judge))[0])
+    """Return the causes of a repeated run; none if it reaches its target."""
+    missed = _missed(judge)
+    return causes(judge, missed, motion_of(*_signals(judge))[0]) if missed else ()
 
 
 def _missed(judge: Judge) -> list[str]:
