@@ -40,13 +40,13 @@ FMI2_Export int by_calls(const double point[3 * N], double result[3 * N * N])
 /* The engine's function for all directions, called once. */
 FMI2_Export int by_engine(const double point[3 * N], double result[3 * N * N])
 {
-    double slope[N][X];
+    double slope[X][N];
     const int status = set_point(point);
     update_rates(&arm->state);
     acceleration_slopes(&arm->state.plant, &arm->state.stops, slope);
     for (int c = 0; c < 3 * N; c++)
         for (int i = 0; i < N; i++)
-            result[c * N + i] = slope[i][c < STATES ? Q + c : TAU_CMD + c - STATES];
+            result[c * N + i] = slope[c < STATES ? Q + c : TAU_CMD + c - STATES][i];
     return status;
 }
 

@@ -41,9 +41,9 @@ class Derivatives(Engine):
     def slopes(self, values, held=None, slip=None):
         """∂ accelerations/∂ known, by the Jacobian."""
         held, slip = (np.zeros(self.n, dtype=np.int32) if x is None else x for x in (held, slip))
-        slopes = np.zeros((self.n, len(self.known)))
+        slopes = np.zeros((len(self.known), self.n))
         self.call("slopes", values.copy(), held, slip, slopes)
-        return slopes
+        return slopes.T
 
     def differences(self, values, held=None, slip=None):
         """The same by central differences, extrapolated."""

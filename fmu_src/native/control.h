@@ -11,12 +11,17 @@ INTERNAL int command(const double value[N_VARIABLES], const JointPosition joint[
                      const double q[N_JOINTS], const double v[N_JOINTS], int rank,
                      double given[N_JOINTS], double *margin);
 
+#ifndef IS_COMPLEX
+typedef double Matrix[N_JOINTS][N_JOINTS];
+
+/* Add ∂(Jᵀ f)/∂q of a force at the task frame to slope. */
+static void add_force(const double f[3], const JointMotion motion[N_BODIES], Matrix slope);
+
 /* Add the derivatives of the law's accelerations, given, by q and v to slope. The motions are those under the law.
    Returns false, and adds nothing, where J has not full rank. */
-#ifndef IS_COMPLEX
 static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                                  const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
-                                 double slope[N_JOINTS][X]);
+                                 double slope[X][N_JOINTS]);
 #endif
 
 #ifdef HAS_RCOND

@@ -1,6 +1,7 @@
 /* Directional and adjoint derivatives. The first direction at a point costs one complex evaluation. The second
    direction at the same point computes the Jacobian of the accelerations; each further direction is a product with it.
    If the previous point had several directions, the first direction already computes the Jacobian. */
+#include <float.h>
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
@@ -21,7 +22,7 @@ typedef struct {
 static const char *culprit(const Reference vr[], size_t count, const double value[])
 {
     for (size_t i = 0; i < count; i++)
-        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
+        for (int k = begin_of(vr[i]); k < end_of(vr[i]); k++)
             if (!isfinite(*value++))
                 return VARIABLE_NAME[k];
     return NULL;
@@ -33,7 +34,7 @@ static int wanted(Instance *instance, const Request *request)
 {
     int wants = 0;
     for (size_t i = 0; i < request->n_unknown; i++) {
-        const int k = INDEX[request->unknown[i]];
+        const int k = begin_of(request->unknown[i]);
         if (k < FIRST_OUTPUT || k >= END_OF_RATES) {
             report(instance, ERROR, "%s: %s is not computed, it has no derivative", call_name(request->call),
                    VARIABLE_NAME[k]);
@@ -43,9 +44,9 @@ static int wanted(Instance *instance, const Request *request)
                                                                                              : WANTS_STATE;
     }
     for (size_t i = 0; i < request->n_given; i++)
-        if (INDEX[request->given[i]] >= X) {
+        if (begin_of(request->given[i]) >= X) {
             report(instance, ERROR, "%s: %s is neither a state nor an input", call_name(request->call),
-                   VARIABLE_NAME[INDEX[request->given[i]]]);
+                   VARIABLE_NAME[begin_of(request->given[i])]);
             return -1;
         }
     return wants;
@@ -59,13 +60,13 @@ static int has_slopes(Instance *instance, int several, const Request *request)
     State *state = &instance->state;
     const int reactions = any_reacts(&state->stops);
     for (size_t i = 0; i < request->n_given && COMMANDS_ACCELERATION && !reactions; i++)
-        if (INDEX[request->given[i]] < TAU_EXT)
+        if (begin_of(request->given[i]) < TAU_EXT)
             return 0;
     if (!(state->has_rates & SLOPES)) {
         several |= state->has_rates & DIRECTION;
         if (several || reactions || instance->asks_several) {
             update_rates(state);
-            acceleration_slopes(&state->plant, &state->stops, &instance->slope[N_JOINTS]);
+            acceleration_slopes(&state->plant, &state->stops, instance->slope);
             state->has_rates |= SLOPES;
         }
         state->has_rates |= DIRECTION;
@@ -74,37 +75,80 @@ static int has_slopes(Instance *instance, int several, const Request *request)
     return state->has_rates & SLOPES;
 }
 
-/* Check a request and its seed, and update the state. If a variable has no derivative or the seed is not finite, log
-   the reason and return NULL. */
-static Instance *prepare(void *component, Request *request, const double of_unknown[], size_t n_of_unknown,
-                         const double of_given[], size_t n_of_given)
+/* Add a column of the Jacobian, times the change of its variable, to the changes of the states' rates. */
+static void add_column(const Instance *instance, int k, double change, double rate[N_STATES])
+{
+    if (k >= V && k < V + N_JOINTS)
+        rate[k - V] += change;
+    for (int r = 0; r < N_JOINTS; r++)
+        rate[N_JOINTS + r] += instance->slope[k][r] * change;
+}
+
+/* True if all references are values from first to before end, in total as many as there are values. */
+static int are_within(const Reference vr[], size_t count, int first, int end, const double value[], size_t n_values)
+{
+    size_t n = 0;
+    for (size_t i = 0; i < count && vr; i++) {
+        if ((FMI == 3 && vr[i] - 1 >= N_REFERENCES) || begin_of(vr[i]) < first || begin_of(vr[i]) >= end)
+            return 0;
+        n += size_of(vr[i]);
+    }
+    return vr && value && n == n_values;
+}
+
+/* Compute the derivatives of rates, if they are products with a known Jacobian. Return 0 if the request needs anything
+   else, or if a result is not finite. */
+static int multiply(const Instance *instance, const Request *request, const double seed[], size_t n_seed,
+                    double result[], size_t n_result)
+{
+    const int first = COMMANDS_ACCELERATION ? TAU_EXT : 0;
+    double rate[N_STATES] = {0};
+    int are_finite = 1;
+    if (!(instance->state.has_rates & SLOPES)
+        || !are_within(request->unknown, request->n_unknown, DER_Q, END_OF_RATES, result, n_result)
+        || !are_within(request->given, request->n_given, first, X, seed, n_seed))
+        return 0;
+    for (size_t i = 0; i < request->n_given; i++)
+        for (int k = begin_of(request->given[i]); k < end_of(request->given[i]); k++)
+            add_column(instance, k, *seed++, rate);
+    for (size_t i = 0; i < request->n_unknown; i++)
+        for (int k = begin_of(request->unknown[i]); k < end_of(request->unknown[i]); k++) {
+            *result++ = rate[k - DER_Q];
+            are_finite &= fabs(rate[k - DER_Q]) <= DBL_MAX;
+        }
+    return are_finite;
+}
+
+/* Check a request and its seed, and update the state. Return 0 if a variable has no derivative or the seed is not
+   finite, and log the reason. */
+static int prepare(Instance *instance, Request *request, const double of_unknown[], size_t n_of_unknown,
+                   const double of_given[], size_t n_of_given)
 {
     const Call call = request->call;
     const int adjoint = call == GET_ADJOINT_DERIVATIVE;
-    Instance *instance = enter(component, call, 1);
-    if (!instance || !known(instance, call, REAL, request->unknown, request->n_unknown, of_unknown, n_of_unknown)
+    if (!known(instance, call, REAL, request->unknown, request->n_unknown, of_unknown, n_of_unknown)
         || !known(instance, call, REAL, request->given, request->n_given, of_given, n_of_given))
-        return NULL;
+        return 0;
     const char *name = adjoint ? culprit(request->unknown, request->n_unknown, of_unknown)
                                : culprit(request->given, request->n_given, of_given);
     if (name) {
         report(instance, ERROR, "%s: the %s of %s is not finite", call_name(call), adjoint ? "weight" : "change", name);
-        return NULL;
+        return 0;
     }
     if ((request->wants = wanted(instance, request)) < 0)
-        return NULL;
+        return 0;
     if (!instance->state.initialised && initialise(instance, 0) != OK)
-        return NULL;
+        return 0;
     if (!update_held(instance)) {
         refuse(instance, call, NO_EFFORT);
-        return NULL;
+        return 0;
     }
     update_stops(&instance->state);
     const int several = adjoint && n_of_given > 1;
     request->by_product = (request->wants & WANTS_RATES) && has_slopes(instance, several, request);
     if (request->by_product)
         request->wants -= WANTS_RATES;
-    return instance;
+    return 1;
 }
 
 /* Compute the change of the unknowns for the seed, a change of the knowns (states and inputs). */
@@ -113,32 +157,27 @@ static Status directional_derivative(void *component, const Reference unknown[],
                                      size_t n_seed, double result[], size_t n_result)
 {
     Request request = {GET_DIRECTIONAL_DERIVATIVE, unknown, given, n_unknown, n_given, 0, 0};
-    Instance *instance = prepare(component, &request, result, n_result, seed, n_seed);
+    Instance *instance = enter(component, request.call, 1);
     if (!instance)
         return ERROR;
+    if (multiply(instance, &request, seed, n_seed, result, n_result))
+        return OK;
+    if (!prepare(instance, &request, result, n_result, seed, n_seed))
+        return ERROR;
     const Stops *stops = &instance->state.stops;
-    double derivative[FIRST_PARAMETER];
-    const double *next = seed;
-    if (request.wants) {
-        double change[X] = {0};
-        for (size_t i = 0; i < n_given; i++)
-            for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++)
-                change[k] += *next++;
+    double change[X] = {0}, derivative[FIRST_PARAMETER] = {0};
+    for (size_t i = 0; i < n_given; i++)
+        for (int k = begin_of(given[i]); k < end_of(given[i]); k++)
+            change[k] += *seed++;
+    if (request.wants)
         differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, request.wants, change,
                       derivative);
-    }
-    if (request.by_product) {
-        double *rate = &derivative[DER_Q];
-        memset(rate, 0, N_STATES * sizeof *rate);
-        next = seed;
-        for (size_t i = 0; i < n_given; i++)
-            for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++, next++)
-                for (int r = 0; r < N_STATES; r++)
-                    rate[r] += instance->slope[r][k] * *next;
-    }
+    for (int k = 0; k < X && request.by_product; k++)
+        if (change[k] != 0.0)
+            add_column(instance, k, change[k], &derivative[DER_Q]);
     double zero = 0.0; /* NaN after a value that is not finite */
     for (size_t i = 0; i < n_unknown; i++)
-        for (int k = INDEX[unknown[i]]; k < INDEX[unknown[i] + 1]; k++)
+        for (int k = begin_of(unknown[i]); k < end_of(unknown[i]); k++)
             zero += 0.0 * (*result++ = derivative[k]);
     if (zero == 0.0)
         return OK;
@@ -153,32 +192,33 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
                                 size_t n_seed, double result[], size_t n_result)
 {
     Request request = {GET_ADJOINT_DERIVATIVE, unknown, given, n_unknown, n_given, 0, 0};
-    Instance *instance = prepare(component, &request, seed, n_seed, result, n_result);
-    if (!instance)
+    Instance *instance = enter(component, request.call, 1);
+    if (!instance || !prepare(instance, &request, seed, n_seed, result, n_result))
         return ERROR;
     const Stops *stops = &instance->state.stops;
     double weight[FIRST_PARAMETER] = {0}, sum[FIRST_PARAMETER] = {0};
     for (size_t i = 0; i < n_unknown; i++)
-        for (int k = INDEX[unknown[i]]; k < INDEX[unknown[i] + 1]; k++)
+        for (int k = begin_of(unknown[i]); k < end_of(unknown[i]); k++)
             weight[k] += *seed++;
     for (size_t i = 0; i < n_given; i++) /* each value of a known is one column of the Jacobian */
-        for (int k = INDEX[given[i]]; k < INDEX[given[i] + 1]; k++) {
-            double change[X] = {0}, derivative[FIRST_PARAMETER];
+        for (int k = begin_of(given[i]); k < end_of(given[i]); k++) {
+            double change[X] = {0}, derivative[FIRST_PARAMETER] = {0};
             change[k] = 1.0;
             if (request.wants)
                 differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, request.wants,
                               change, derivative);
+            if (request.by_product)
+                add_column(instance, k, 1.0, &derivative[DER_Q]);
             sum[k] = 0.0;
             for (int u = FIRST_OUTPUT; u < END_OF_RATES; u++)
                 if (weight[u] != 0.0)
-                    sum[k] += weight[u] * (request.by_product && u >= DER_Q ? instance->slope[u - DER_Q][k]
-                                                                            : derivative[u]);
+                    sum[k] += weight[u] * derivative[u];
             if (!isfinite(sum[k]))
                 return report(instance, DISCARD, "%s: that by %s is not finite", call_name(request.call),
                               VARIABLE_NAME[k]);
         }
     for (size_t i = 0; i < n_given; result += size_of(given[i++]))
-        memcpy(result, &sum[INDEX[given[i]]], size_of(given[i]) * sizeof *result);
+        memcpy(result, &sum[begin_of(given[i])], size_of(given[i]) * sizeof *result);
     return OK;
 }
 #endif

@@ -17,7 +17,7 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
 #ifndef IS_COMPLEX
 static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                                  const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
-                                 double slope[N_JOINTS][X])
+                                 double slope[X][N_JOINTS])
 {
     (void)value, (void)joint, (void)motion, (void)given, (void)rank, (void)slope;
     return 1;

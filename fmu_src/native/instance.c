@@ -202,7 +202,7 @@ static Instance *instantiate(Instance draft, const char *token, int logging_on)
         report(&draft, ERROR, "%s: the " TOKEN " is not that of this FMU, " MODEL_GUID, function);
         return NULL;
     }
-    const size_t matrix = N_STATES * sizeof *draft.slope;
+    const size_t matrix = X * sizeof *draft.slope;
     Instance *instance = calloc(1, sizeof *instance + matrix + strlen(name) + 1);
     if (!instance) {
         report(&draft, ERROR, "%s: no memory", function);
@@ -210,9 +210,7 @@ static Instance *instantiate(Instance draft, const char *token, int logging_on)
     }
     *instance = draft;
     instance->silent = logging_on ? 0 : EVERY_CATEGORY - CATEGORIES_OFF;
-    instance->slope = (double(*)[X])(instance + 1);
-    for (int i = 0; i < N_JOINTS; i++)
-        instance->slope[i][V + i] = 1.0;
+    instance->slope = (double(*)[N_JOINTS])(instance + 1);
     instance->name = strcpy((char *)(instance + 1) + matrix, name);
     reset_state(instance);
     return instance;

@@ -99,7 +99,7 @@ typedef struct {
     void (*log)(void); /* the importer's callback; fmi2.c and fmi3.c know its type */
     void *environment; /* argument of the callback */
     const char *name;
-    double (*slope)[X]; /* the Jacobian: derivatives of the states' rates with respect to inputs and states */
+    double (*slope)[N_JOINTS]; /* the Jacobian: derivatives of the accelerations, for each input and state */
     int asks_several;   /* whether the last point had several directions */
     int has_clock;      /* whether the importer ticks the clock */
     int silent; /* bit mask of the log categories that are off; 0 before instantiation */

@@ -7,18 +7,12 @@
    where M̂ and ÎD are those of the robot as its law knows it. If it knows all and no effort is limited, the difference of
    both ∂ID is that for the acceleration q̈ − q̈_cmd without velocity and gravity, and δq̈ contains δq̈_cmd.
    Source: Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018. */
+#include "control.h"
 #include "directional.h"
 #include "stops.h"
 
 #include <math.h>
 #include <string.h>
-
-/* Terms of all bodies, and the mass matrix. */
-typedef struct {
-    JointMotion motion[N_BODIES];
-    JointForce force[N_BODIES];
-    double M[N_JOINTS][N_JOINTS];
-} Dynamics;
 
 static double dot_of(const double a[], const double b[], int count)
 {
@@ -28,126 +22,131 @@ static double dot_of(const double a[], const double b[], int count)
     return sum;
 }
 
-/* Compute the terms of inverse dynamics. */
-static void compute_dynamics(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], int as_known,
-                             const double v[N_JOINTS], const double a[N_JOINTS], const double gravity[3],
-                             Dynamics *all)
+/* Add the products of M with the vectors b from first to before end to those of sum, except those of tau_ext. */
+static void add_products(Matrix M, double b[X][N_JOINTS], int first, int end, double sum[X][N_JOINTS])
 {
-    EndBody end_body;
-    body(value, as_known, &end_body);
-    joint_forces(joint, &end_body, &value[ARMATURE], v, a, gravity, all->motion, all->force);
-    memset(all->M, 0, sizeof all->M);
-    for (int i = 0; i < N_JOINTS; i++)
-        all->M[i][i] = value[ARMATURE + i];
-    for (int i = 0; i < N_BODIES; i++)
-        for (int j = i; j >= 0; j = PARENT[j]) {
-            const double mass = RATIO[i] * RATIO[j] * dot_of(all->force[i].inertial, all->motion[j].s, 6);
-            all->M[LEADER[i]][LEADER[j]] += mass;
-            if (i != j)
-                all->M[LEADER[j]][LEADER[i]] += mass;
-        }
+    for (int c = first; c < end; c++) {
+        double product[N_JOINTS];
+        if (c >= TAU_EXT && c < F_EXT)
+            continue;
+        memcpy(product, sum[c], sizeof product);
+        for (int k = 0; k < N_JOINTS; k++)
+            for (int i = 0; i < N_JOINTS; i++)
+                product[i] += M[k][i] * b[c][k];
+        memcpy(sum[c], product, sizeof product);
+    }
 }
 
 /* Add the weighted rows of ∂ID by q and v to slope. */
-static void add_inverse_dynamics(const Dynamics *all, const double weight[N_JOINTS], double slope[N_JOINTS][X])
+static void add_inverse_dynamics(const JointMotion motion[N_BODIES], const JointForce force[N_BODIES],
+                                 const double weight[N_JOINTS], double slope[X][N_JOINTS])
 {
     for (int i = 0; i < N_BODIES; i++)
         for (int j = i; j >= 0; j = PARENT[j]) {
-            const JointForce *f = &all->force[i];
-            const JointMotion *m = &all->motion[j];
+            const JointForce *f = &force[i];
+            const JointMotion *m = &motion[j];
             const int r = LEADER[i], c = LEADER[j];
-            const double row = RATIO[i] * RATIO[j] * weight[r], column = RATIO[i] * RATIO[j] * weight[c];
-            slope[r][Q + c] += row * (2.0 * dot_of(f->coriolis, m->psi, 3) + dot_of(f->inertial, m->chi, 6));
-            slope[r][V + c] += 2.0 * row * (dot_of(f->coriolis, m->s, 3) + dot_of(f->inertial, m->psi, 6));
+            slope[Q + c][r] += weight[r] * (2.0 * dot_of(f->coriolis, m->psi, 3) + dot_of(f->inertial, m->chi, 6));
+            slope[V + c][r] += weight[r] * 2.0 * (dot_of(f->coriolis, m->s, 3) + dot_of(f->inertial, m->psi, 6));
             if (i == j)
                 continue;
-            slope[c][Q + r] += column * dot_of(f->by_q, m->s, 6);
-            slope[c][V + r] += column * dot_of(f->by_v, m->s, 6);
+            slope[Q + r][c] += weight[c] * dot_of(f->by_q, m->s, 6);
+            slope[V + r][c] += weight[c] * dot_of(f->by_v, m->s, 6);
         }
 }
 
-/* Add ∂(Jᵀ f)/∂q of the external force, with the Jacobian's columns J_i, which turn with the joints j before them. */
-static void add_external_force(const double f[3], const JointMotion motion[N_BODIES], double slope[N_JOINTS][X])
+/* The Jacobian's columns J_i turn with the joints j before them. */
+static void add_force(const double f[3], const JointMotion motion[N_BODIES], Matrix slope)
 {
-    for (int i = END_BODY; i >= 0; i = PARENT[i])
-        for (int j = i; j >= 0; j = PARENT[j]) {
-            const double *z = motion[j].s, *J = &motion[i].s[3];
-            const double turn = f[0] * (z[1] * J[2] - z[2] * J[1]) + f[1] * (z[2] * J[0] - z[0] * J[2])
-                                + f[2] * (z[0] * J[1] - z[1] * J[0]);
-            slope[LEADER[i]][Q + LEADER[j]] += RATIO[i] * RATIO[j] * turn;
+    for (int j = END_BODY; j >= 0; j = PARENT[j]) {
+        const double *z = motion[j].s;
+        const double turned[3] = {f[1] * z[2] - f[2] * z[1], f[2] * z[0] - f[0] * z[2], f[0] * z[1] - f[1] * z[0]};
+        for (int i = END_BODY; i >= j; i = PARENT[i]) {
+            const double turn = dot_of(turned, &motion[i].s[3], 3);
+            slope[LEADER[i]][LEADER[j]] += turn;
             if (i != j)
-                slope[LEADER[j]][Q + LEADER[i]] += RATIO[i] * RATIO[j] * turn;
+                slope[LEADER[j]][LEADER[i]] += turn;
         }
+    }
 }
 
-/* slope = M⁻¹ slope, from a column on, in the rows of free joints, with M = Lᵀ D L from the last joint inwards; 0 in the others. */
-static void divide_by_mass(double M[N_JOINTS][N_JOINTS], const Stops *stops, int first, double slope[N_JOINTS][X])
+/* Invert M in the rows and columns of free joints, by Gauss and Jordan; the others become 0. */
+static void invert_mass(Matrix M, const Stops *stops)
 {
     for (int k = N_JOINTS; k-- > 0;) {
         const double inverse = reacts(stops, k) ? 0.0 : 1.0 / M[k][k];
-        for (int i = k; i-- > 0;) {
-            const double share = M[k][i] * inverse;
-            for (int j = 0; j <= i && share != 0.0; j++)
-                M[i][j] -= share * M[k][j];
-            for (int c = first; c < X && share != 0.0; c++)
-                slope[i][c] -= share * slope[k][c];
-            M[k][i] = share;
+        double row[N_JOINTS];
+        for (int j = 0; j < N_JOINTS; j++) {
+            row[j] = j == k ? inverse : M[k][j] * inverse;
+            M[k][j] = 0.0;
         }
-        for (int c = first; c < X; c++)
-            slope[k][c] *= inverse;
+        for (int i = 0; i < N_JOINTS; i++) {
+            const double share = M[i][k];
+            M[i][k] = 0.0;
+            for (int j = 0; j < N_JOINTS; j++)
+                M[i][j] -= share * row[j];
+        }
+        memcpy(M[k], row, sizeof row);
     }
-    for (int k = 1; k < N_JOINTS; k++)
-        for (int i = 0; i < k; i++)
-            for (int c = first; c < X && M[k][i] != 0.0; c++)
-                slope[k][c] -= M[k][i] * slope[i][c];
 }
 
 /* Add the derivatives of the law's result by states and, from a column on, inputs to slope. */
 static void add_command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops,
                         int first, const double given[N_JOINTS], const JointMotion motion[N_BODIES],
-                        double slope[N_JOINTS][X])
+                        double slope[X][N_JOINTS])
 {
-    const int end = add_command_by_states(value, joint, motion, given, stops->rank, slope) ? Q : X;
-    for (int k = first; k < end && COMMANDS_ACCELERATION; k++) {
-        double change[X] = {0}, derivative[FIRST_PARAMETER];
-        if (k >= TAU_EXT && k < F_EXT + 3)
+    const int by_states = add_command_by_states(value, joint, motion, given, stops->rank, slope);
+    for (int k = first; k < X; k++) {
+        if (k >= TAU_EXT && (by_states || k < F_EXT + 3 || (k >= Q - N_FREE && k < Q)))
             continue;
+        double change[X] = {0}, derivative[FIRST_PARAMETER];
         change[k] = 1.0;
         differentiate(value, stops->held, stops->slip, stops->rank, WANTS_LAW, change, derivative);
         for (int i = 0; i < N_JOINTS; i++)
-            slope[i][k] += derivative[DER_V + i];
+            slope[k][i] += derivative[DER_V + i];
     }
 }
 
-/* Set slope to δτ of the law for its result; acts receives 0 for efforts at their limit and else 1. Returns true, and
-   slope stays 0, if δτ cancels except for δq̈_cmd. */
-static int set_law(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops, int first,
-                   const double given[N_JOINTS], double acts[N_JOINTS], Dynamics *all, double slope[N_JOINTS][X])
+/* Set acts to 0 for efforts of the law at their limit and else to 1. Return true if none is. */
+static int all_act(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const double given[N_JOINTS],
+                   double acts[N_JOINTS])
 {
-    double tau[N_JOINTS], column[N_JOINTS];
-    int cancels = knows_all(value) && !any_reacts(stops);
-    wanted_effort(value, joint, &value[V], given, tau);
+    const int limited = value[LIMIT_EFFORT] != 0.0;
+    double tau[N_JOINTS] = {0};
+    int all = 1;
+    if (limited)
+        wanted_effort(value, joint, &value[V], given, tau);
     for (int i = 0; i < N_JOINTS; i++) {
-        acts[i] = value[LIMIT_EFFORT] == 0.0 || fabs(tau[i]) <= EFFORT[i];
-        cancels = cancels && acts[i] != 0.0;
+        acts[i] = !limited || fabs(tau[i]) <= EFFORT[i];
+        all = all && acts[i] != 0.0;
     }
-    if (cancels || !COMMANDS_ACCELERATION)
-        return cancels;
-    compute_dynamics(value, joint, 1, &value[V], given, &value[GRAVITY], all);
-    add_command(value, joint, stops, first, given, all->motion, slope);
-    for (int c = first; c < X; c++) {
-        for (int i = 0; i < N_JOINTS; i++)
-            column[i] = slope[i][c];
-        for (int i = 0; i < N_JOINTS; i++)
-            slope[i][c] = acts[i] * dot_of(all->M[i], column, N_JOINTS);
-    }
-    add_inverse_dynamics(all, acts, slope);
-    return 0;
+    return all;
+}
+
+/* Add δτ of a law for its acceleration, given, with the model that it knows, to slope. */
+static void add_law(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops, int first,
+                    const double given[N_JOINTS], const double acts[N_JOINTS], double slope[X][N_JOINTS])
+{
+    double change[X][N_JOINTS] = {{0}};
+    JointMotion motion[N_BODIES];
+    JointForce force[N_BODIES];
+    EndBody known;
+    Matrix M;
+    body(value, 1, &known);
+    joint_motions(joint, &value[V], given, &value[GRAVITY], motion);
+    joint_forces(&known, motion, force);
+    add_inverse_dynamics(motion, force, acts, slope);
+    add_command(value, joint, stops, first, given, motion, change);
+    mass_matrix(joint, &known, &value[ARMATURE], M);
+    for (int i = 0; i < N_JOINTS; i++)
+        for (int k = 0; k < N_JOINTS; k++)
+            M[k][i] *= acts[i];
+    add_products(M, change, first, X, slope);
 }
 
 /* Set the columns of the parameters that are inputs to M ∂q̈ with constant reactions. */
-static void add_free_parameters(const Plant *plant, const Stops *stops, const double reaction[N_JOINTS],
-                                const Dynamics *all, double slope[N_JOINTS][X])
+static void add_free_parameters(const Plant *plant, const Stops *stops, const double reaction[N_JOINTS], Matrix M,
+                                double slope[X][N_JOINTS])
 {
     const int moves[N_JOINTS] = {FREE};
     Plant acting = *plant;
@@ -158,24 +157,78 @@ static void add_free_parameters(const Plant *plant, const Stops *stops, const do
         change[k] = 1.0;
         differentiate(acting.value, moves, stops->slip, stops->rank, WANTS_RATES, change, derivative);
         for (int i = 0; i < N_JOINTS; i++)
-            slope[i][k] = dot_of(all->M[i], &derivative[DER_V], N_JOINTS);
+            slope[k][i] = dot_of(M[i], &derivative[DER_V], N_JOINTS);
     }
 }
 
-void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_JOINTS][X])
+/* Add ∂(Jᵀ f) of the external force by q and f to slope; return false if that by q is 0. */
+static int add_external_force(const double f[3], const JointMotion motion[N_BODIES], double slope[X][N_JOINTS])
 {
-    const double *value = plant->value, *v = &value[V], nothing[N_JOINTS + 3] = {0};
-    double a[N_JOINTS], given[N_JOINTS], acts[N_JOINTS] = {0}, minus[N_JOINTS], reaction[N_JOINTS] = {0};
+    Matrix turned = {{0}};
+    for (int i = END_BODY; i >= 0; i = PARENT[i])
+        for (int k = 0; k < 3; k++)
+            slope[F_EXT + k][LEADER[i]] += motion[i].s[3 + k];
+    if (f[0] == 0.0 && f[1] == 0.0 && f[2] == 0.0)
+        return 0;
+    add_force(f, motion, turned);
+    for (int i = 0; i < N_JOINTS; i++)
+        for (int k = 0; k < N_JOINTS; k++)
+            slope[Q + k][i] += turned[i][k];
+    return 1;
+}
+
+/* Set slope to the part of δq̈ that no effort causes, and effort to the M δq̈ of all efforts but tau_ext and damping.
+   a is the acceleration on which reactions act. Returns false if no effort depends on q and v. */
+static int set_efforts(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops,
+                       const EndBody *end_body, int first, double a[N_JOINTS], double acts[N_JOINTS],
+                       double slope[X][N_JOINTS], double effort[X][N_JOINTS])
+{
+    const double *v = &value[V], nothing[N_JOINTS + 3] = {0};
+    double given[N_JOINTS], minus[N_JOINTS];
+    JointMotion motion[N_BODIES];
+    JointForce force[N_BODIES];
+    int cancels = 0, moves = 1;
+    if (!is_held(value)) {
+        command(value, joint, &value[Q], v, stops->rank, given, NULL);
+        cancels = all_act(value, joint, given, acts) && knows_all(value) && !any_reacts(stops);
+        if (cancels) {
+            joint_motions(joint, v, given, &value[GRAVITY], motion);
+            add_command(value, joint, stops, first, given, motion, slope);
+        } else if (COMMANDS_ACCELERATION) {
+            add_law(value, joint, stops, first, given, acts, effort);
+        }
+    }
+    for (int i = 0; i < N_JOINTS; i++)
+        minus[i] = -1.0;
+    for (int i = 0; i < N_JOINTS && cancels; i++) {
+        moves = (i > 0 && moves) || a[i] != given[i];
+        a[i] -= given[i];
+    }
+    if (moves) {
+        joint_motions(joint, cancels ? nothing : v, a, cancels ? nothing : &value[GRAVITY], motion);
+        joint_forces(end_body, motion, force);
+        add_inverse_dynamics(motion, force, minus, effort);
+    }
+    return add_external_force(&value[F_EXT], motion, effort) || moves;
+}
+
+/* The derivatives of q̈ with respect to efforts and states, and with reactions also to inputs of the law: a row for each
+   variable, by its index, at a plant with the derivatives of compute_rates. */
+static void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[X][N_JOINTS])
+{
+    const double *value = plant->value, *v = &value[V];
+    double a[N_JOINTS], acts[N_JOINTS] = {0}, reaction[N_JOINTS] = {0}, effort[X][N_JOINTS];
     JointPosition joint[N_BODIES];
-    Dynamics all;
+    EndBody end_body;
+    Matrix M;
     Stops reacting = *stops;
+    int clamped = 0;
     const int first = COMMANDS_ACCELERATION && any_reacts(stops) ? 0 : TAU_EXT;
-    int clamped = 0, cancels = 0, deviates = 0;
-    memset(slope, 0, N_JOINTS * sizeof *slope);
+    memset(slope[first], 0, (X - first) * sizeof *slope);
+    memset(effort[first], 0, (X - first) * sizeof *effort);
     for (int i = 0; i < N_JOINTS; i++) {
         reacting.held[i] = reacts(stops, i) ? stops->held[i] : FREE;
         clamped |= stops->held[i] == CLAMPED;
-        minus[i] = -1.0;
     }
     place_joints(&value[Q], joint);
     memcpy(a, &value[DER_V], sizeof a);
@@ -183,41 +236,22 @@ void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_
         acceleration(plant, &value[Q], v, slip_of(stops), stops->rank, a, NULL);
         restrain(plant, &reacting, &value[Q], a, reaction);
     }
-    if (!is_held(value)) {
-        command(value, joint, &value[Q], v, stops->rank, given, NULL);
-        cancels = set_law(value, joint, stops, first, given, acts, &all, slope);
-    }
-    for (int i = 0; i < N_JOINTS && cancels; i++) {
-        a[i] -= given[i];
-        deviates |= a[i] != 0.0;
-    }
-    if (cancels && !deviates) {
-        compute_dynamics(value, joint, 0, v, given, &value[GRAVITY], &all);
-    } else {
-        compute_dynamics(value, joint, 0, cancels ? nothing : v, a, cancels ? nothing : &value[GRAVITY], &all);
-        add_inverse_dynamics(&all, minus, slope);
-    }
-    add_external_force(&value[F_EXT], all.motion, slope);
-    for (int i = END_BODY; i >= 0; i = PARENT[i])
-        for (int k = 0; k < 3; k++)
-            slope[LEADER[i]][F_EXT + k] += RATIO[i] * all.motion[i].s[3 + k];
-    for (int i = 0; i < N_JOINTS; i++) {
-        slope[i][TAU_EXT + i] = 1.0;
-        slope[i][V + i] -= value[DAMPING + i];
-    }
+    body(value, 0, &end_body);
+    const int moves = set_efforts(value, joint, stops, &end_body, first, a, acts, slope, effort);
+    mass_matrix(joint, &end_body, &value[ARMATURE], M);
     if (N_FREE)
-        add_free_parameters(plant, stops, reaction, &all, slope);
-    divide_by_mass(all.M, stops, first, slope);
-    if (cancels && deviates)
-        compute_dynamics(value, joint, 0, v, given, &value[GRAVITY], &all);
-    if (cancels)
-        add_command(value, joint, stops, first, given, all.motion, slope);
-    for (int i = 0; i < N_JOINTS; i++) {
-        if (stops->held[i])
-            memset(slope[i], 0, sizeof slope[i]);
+        add_free_parameters(plant, stops, reaction, M, effort);
+    invert_mass(M, stops);
+    add_products(M, effort, first, moves ? X : Q, slope);
+    for (int k = 0; k < N_JOINTS; k++)
+        for (int i = 0; i < N_JOINTS; i++) {
+            slope[TAU_EXT + k][i] = M[k][i];
+            slope[V + k][i] -= M[k][i] * value[DAMPING + k];
 #if !COMMANDS_ACCELERATION
-        for (int k = 0; k < N_JOINTS; k++)
-            slope[i][TAU_CMD + k] = acts[k] * slope[i][TAU_EXT + k];
+            slope[TAU_CMD + k][i] = acts[k] * M[k][i];
 #endif
-    }
+        }
+    for (int i = 0; i < N_JOINTS; i++)
+        for (int c = 0; c < X && stops->held[i]; c++)
+            slope[c][i] = 0.0;
 }

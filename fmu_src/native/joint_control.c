@@ -18,12 +18,12 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
 #ifndef IS_COMPLEX
 static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                                  const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
-                                 double slope[N_JOINTS][X])
+                                 double slope[X][N_JOINTS])
 {
     (void)joint, (void)motion, (void)given, (void)rank;
     for (int i = 0; i < N_JOINTS; i++) {
-        slope[i][Q + i] -= value[KP + i];
-        slope[i][V + i] -= value[KD + i];
+        slope[Q + i][i] -= value[KP + i];
+        slope[V + i][i] -= value[KD + i];
     }
     return 1;
 }

@@ -74,10 +74,11 @@ INTERNAL void hybrid_dynamics(const JointPosition joint[N_BODIES], const EndBody
 #endif
 
 /* Derivatives of kinematics and dynamics by spatial vectors in the root's axes about the task frame's origin (angular,
-   linear; of forces moment, force). At a body's joint: its unit velocity s, ψ = v × s, χ = a × s + v × ψ, where v and a
-   are the motion of the body before it. */
+   linear; of forces moment, force). At a body's joint: its velocity s at the unit velocity of the joint that it follows,
+   ψ = v × s, χ = a × s + v × ψ, where v and a are the motion of the body before it; the motion, the axes and the origin
+   of its own body. */
 typedef struct {
-    double s[6], psi[6], chi[6];
+    double s[6], psi[6], chi[6], velocity[6], acceleration[6], R[3][3], origin[3];
 } JointMotion;
 
 /* Of all bodies that a joint moves: the angular part of Bᵀ s, whose linear part is 0, I s, and with the motion x of a
@@ -87,9 +88,13 @@ typedef struct {
 } JointForce;
 
 #ifndef IS_COMPLEX
-INTERNAL void joint_forces(const JointPosition joint[N_BODIES], const EndBody *end_body,
-                           const double armature[N_JOINTS], const double v[N_JOINTS], const double a[N_JOINTS],
-                           const double gravity[3], JointMotion motion[N_BODIES], JointForce force[N_BODIES]);
+INTERNAL void joint_motions(const JointPosition joint[N_BODIES], const double v[N_JOINTS], const double a[N_JOINTS],
+                            const double gravity[3], JointMotion motion[N_BODIES]);
+INTERNAL void joint_forces(const EndBody *end_body, const JointMotion motion[N_BODIES], JointForce force[N_BODIES]);
+
+/* M(q), with the armature. */
+INTERNAL void mass_matrix(const JointPosition joint[N_BODIES], const EndBody *end_body,
+                          const double armature[N_JOINTS], double M[N_JOINTS][N_JOINTS]);
 #endif
 
 /* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */

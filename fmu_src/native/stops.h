@@ -17,10 +17,4 @@ typedef struct {
     int rank;
 } Stops;
 
-#ifndef IS_COMPLEX
-/* The derivatives of q̈ with respect to efforts and states, and with reactions also to inputs of the law, by the
-   variable's index, at a plant with the derivatives of compute_rates. */
-INTERNAL void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[N_JOINTS][X]);
-#endif
-
 #endif

@@ -12,7 +12,8 @@
 /* Of the joints on the way to the task frame: rows of the derivatives of the wanted and the actual acceleration, by q
    and v, and δJᵀ y by q. */
 typedef struct {
-    double by_q[N_ROWS][N_JOINTS], by_v[N_ROWS][N_JOINTS], turned[N_JOINTS][N_JOINTS];
+    double by_q[N_ROWS][N_JOINTS], by_v[N_ROWS][N_JOINTS];
+    Matrix turned;
 } TaskSlopes;
 
 static void cross(const double a[3], const double b[3], double result[3])
@@ -67,14 +68,14 @@ static void move_end(const double v[N_JOINTS], const double a[N_JOINTS], const J
 {
     for (int i = END_BODY; i >= 0; i = PARENT[i])
         for (int k = 0; k < 6; k++) {
-            const double rate = RATIO[i] * v[LEADER[i]];
+            const double rate = v[LEADER[i]];
             velocity[k] += motion[i].s[k] * rate;
-            acceleration[k] += motion[i].psi[k] * rate + motion[i].s[k] * RATIO[i] * a[LEADER[i]];
+            acceleration[k] += motion[i].psi[k] * rate + motion[i].s[k] * a[LEADER[i]];
         }
 }
 
 /* Add the rows of δw − δẍ for a body's joint. */
-static void add_rows(const double value[N_VARIABLES], TaskFrame *task, const JointMotion *motion,
+static void add_rows(const double value[N_VARIABLES], const double error[3], const JointMotion *motion,
                      const double velocity[6], const double acceleration[6], int i, TaskSlopes *slopes)
 {
     const double *s = motion->s, *omega = velocity;
@@ -95,64 +96,56 @@ static void add_rows(const double value[N_VARIABLES], TaskFrame *task, const Joi
     for (int r = 0; r < N_AXES; r++) {
         const int k = 3 + AXIS[r];
         const double Kd = value[KD + r];
-        slopes->by_q[r][LEADER[i]] -= RATIO[i] * (Kd * moved[k] + value[KP + r] * s[k] + by_q[k]);
-        slopes->by_v[r][LEADER[i]] -= RATIO[i] * (Kd * s[k] + by_v[k]);
+        slopes->by_q[r][LEADER[i]] -= Kd * moved[k] + value[KP + r] * s[k] + by_q[k];
+        slopes->by_v[r][LEADER[i]] -= Kd * s[k] + by_v[k];
     }
 #if N_ROWS > N_AXES
-    double error[3], turned[3];
-    rotation_error(&value[QUAT_DES], task->R, error);
+    double turned[3];
     error_slope(error, s, turned);
     for (int k = 0; k < 3; k++) {
         const double Kd = value[KD_ROT + k];
-        slopes->by_q[N_AXES + k][LEADER[i]] -= RATIO[i] * (Kd * moved[k] - value[KP_ROT + k] * turned[k] + by_q[k]);
-        slopes->by_v[N_AXES + k][LEADER[i]] -= RATIO[i] * (Kd * s[k] + by_v[k]);
+        slopes->by_q[N_AXES + k][LEADER[i]] -= Kd * moved[k] - value[KP_ROT + k] * turned[k] + by_q[k];
+        slopes->by_v[N_AXES + k][LEADER[i]] -= Kd * s[k] + by_v[k];
     }
 #else
-    (void)task;
+    (void)error;
 #endif
 }
 
 /* Add δJᵀ y by q: joint j turns the columns of J of the joints i after it, and moves the task frame for those before
    it. y has angular and linear components in the root's axes. */
-static void add_turned(const JointMotion motion[N_BODIES], const double y[6], TaskSlopes *slopes)
+static void add_turned(const JointMotion motion[N_BODIES], const double y[6], Matrix turned)
 {
-    for (int i = END_BODY; i >= 0; i = PARENT[i])
-        for (int j = i; j >= 0; j = PARENT[j]) {
-            double linear[3], angular[3];
-            cross(motion[j].s, motion[i].s + 3, linear);
-            cross(motion[j].s, motion[i].s, angular);
-            const double both = y[3] * linear[0] + y[4] * linear[1] + y[5] * linear[2];
-            const double turn = y[0] * angular[0] + y[1] * angular[1] + y[2] * angular[2];
-            const double ratio = RATIO[i] * RATIO[j];
-            slopes->turned[LEADER[i]][LEADER[j]] += ratio * (both + turn);
-            if (i != j)
-                slopes->turned[LEADER[j]][LEADER[i]] += ratio * both;
-        }
+    add_force(&y[3], motion, turned);
+    for (int j = END_BODY; j >= 0 && N_ROWS > N_AXES; j = PARENT[j]) {
+        double moment[3];
+        cross(y, motion[j].s, moment);
+        for (int i = END_BODY; i > j; i = PARENT[i])
+            turned[LEADER[i]][LEADER[j]] += moment[0] * motion[i].s[0] + moment[1] * motion[i].s[1] + moment[2] * motion[i].s[2];
+    }
 }
 
-/* J⁺ and y = J⁺ᵀ (q̈_cmd + Kn v), with the components of y in the root's axes. */
+/* The columns of J⁺, and y = J⁺ᵀ (q̈_cmd + Kn v), with the components of y in the root's axes. */
 static void invert(const double value[N_VARIABLES], const TaskFrame *task, const double given[N_JOINTS],
-                   double inverse[N_JOINTS][N_ROWS], double y[6])
+                   double inverse[N_ROWS][N_JOINTS], double y[6])
 {
     for (int r = 0; r < N_ROWS; r++) {
-        double J[N_ROWS][N_JOINTS], unit[N_ROWS] = {0}, column[N_JOINTS], sum = 0.0;
+        double J[N_ROWS][N_JOINTS], unit[N_ROWS] = {0}, sum = 0.0;
         memcpy(J, task->J, sizeof J);
         unit[r] = 1.0;
-        apply_pseudo_inverse(J, unit, value[RCOND], N_ROWS, column, NULL);
-        for (int i = 0; i < N_JOINTS; i++) {
-            inverse[i][r] = column[i];
-            sum += column[i] * (given[i] + value[KN] * value[V + i]);
-        }
+        apply_pseudo_inverse(J, unit, value[RCOND], N_ROWS, inverse[r], NULL);
+        for (int i = 0; i < N_JOINTS; i++)
+            sum += inverse[r][i] * (given[i] + value[KN] * value[V + i]);
         y[r < N_AXES ? 3 + AXIS[r] : r - N_AXES] = sum;
     }
 }
 
 static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                                  const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
-                                 double slope[N_JOINTS][X])
+                                 double slope[X][N_JOINTS])
 {
     const double Kn = value[KN];
-    double inverse[N_JOINTS][N_ROWS], y[6] = {0}, velocity[6] = {0};
+    double inverse[N_ROWS][N_JOINTS], y[6] = {0}, velocity[6] = {0}, error[3] = {0};
     double acceleration[6] = {0.0, 0.0, 0.0, -value[GRAVITY], -value[GRAVITY + 1], -value[GRAVITY + 2]};
     TaskFrame task;
     TaskSlopes slopes;
@@ -161,10 +154,13 @@ static int add_command_by_states(const double value[N_VARIABLES], const JointPos
     memset(&slopes, 0, sizeof slopes);
     task_frame(joint, &value[V], &task);
     invert(value, &task, given, inverse, y);
+#if N_ROWS > N_AXES
+    rotation_error(&value[QUAT_DES], task.R, error);
+#endif
     move_end(&value[V], given, motion, velocity, acceleration);
     for (int i = END_BODY; i >= 0; i = PARENT[i])
-        add_rows(value, &task, &motion[i], velocity, acceleration, i, &slopes);
-    add_turned(motion, y, &slopes);
+        add_rows(value, error, &motion[i], velocity, acceleration, i, &slopes);
+    add_turned(motion, y, slopes.turned);
     for (int r = 0; r < N_ROWS; r++)
         for (int c = 0; c < N_JOINTS; c++)
             for (int k = 0; k < N_JOINTS; k++) {
@@ -172,14 +168,19 @@ static int add_command_by_states(const double value[N_VARIABLES], const JointPos
                 slopes.by_v[r][c] += k == c ? Kn * task.J[r][k] : 0.0;
             }
     for (int i = 0; i < N_JOINTS; i++) {
-        for (int c = 0; c < N_JOINTS; c++) {
-            slope[i][Q + c] += slopes.turned[i][c];
-            for (int r = 0; r < N_ROWS; r++) {
-                slope[i][Q + c] += inverse[i][r] * slopes.by_q[r][c];
-                slope[i][V + c] += inverse[i][r] * slopes.by_v[r][c];
+        slope[KN][i] -= value[V + i];
+        for (int r = 0; r < N_ROWS; r++)
+            slope[KN][i] += inverse[r][i] * task.xd[r];
+    }
+    for (int c = 0; c < N_JOINTS; c++) {
+        for (int r = 0; r < N_ROWS; r++)
+            for (int i = 0; i < N_JOINTS; i++) {
+                slope[Q + c][i] += inverse[r][i] * slopes.by_q[r][c];
+                slope[V + c][i] += inverse[r][i] * slopes.by_v[r][c];
             }
-        }
-        slope[i][V + i] -= Kn;
+        for (int i = 0; i < N_JOINTS; i++)
+            slope[Q + c][i] += slopes.turned[i][c];
+        slope[V + c][c] -= Kn;
     }
     return 1;
 }

@@ -10,9 +10,20 @@
 typedef enum { REAL, BOOLEAN, INTEGER, OTHER } Type;
 static const char *const TYPE_NAME[] = {REAL_NAME, "Boolean", INTEGER_NAME};
 
+/* The values of a reference: from begin_of to before end_of. In FMI 2.0 each reference has one. */
+static int begin_of(Reference vr)
+{
+    return FMI == 2 ? (int)(vr - 1) : INDEX[vr];
+}
+
+static int end_of(Reference vr)
+{
+    return FMI == 2 ? (int)vr : INDEX[vr + 1];
+}
+
 static size_t size_of(Reference vr)
 {
-    return (size_t)(INDEX[vr + 1] - INDEX[vr]);
+    return (size_t)(end_of(vr) - begin_of(vr));
 }
 
 /* True if all references are variables of a type, and have the given total number of values. */
@@ -30,11 +41,11 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
                    call_name(call), (unsigned long)vr[i]);
             return 0;
         }
-        const int place = INDEX[vr[i]];
+        const int place = begin_of(vr[i]);
         const Type actual = place >= FIRST_BOOLEAN ? BOOLEAN : place >= FIRST_INTEGER ? INTEGER : REAL;
         if (actual != type) {
             report(instance, ERROR, "%s: %s is of type %s", call_name(call),
-                   VARIABLE_NAME[INDEX[vr[i]]], TYPE_NAME[actual]);
+                   VARIABLE_NAME[begin_of(vr[i])], TYPE_NAME[actual]);
             return 0;
         }
         wanted += size_of(vr[i]);
@@ -161,14 +172,14 @@ static Status get_values(void *component, Call call, const Reference vr[], size_
     if (!instance || !known(instance, call, type, vr, count, values, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
+        for (int k = begin_of(vr[i]); k < end_of(vr[i]); k++)
             if (k >= FIRST_OUTPUT && k < FIRST_PARAMETER) {
                 const Status status = update(instance, k);
                 if (status != OK)
                     return status;
             }
     for (size_t i = 0; i < count; i++)
-        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++, n++) {
+        for (int k = begin_of(vr[i]); k < end_of(vr[i]); k++, n++) {
             const double number = instance->state.plant.value[k];
             if (type == REAL)
                 ((double *)values)[n] = number;
@@ -201,11 +212,11 @@ static Status set_values(void *component, Call call, const Reference vr[], size_
     if (!instance || !known(instance, call, type, vr, count, values, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
+        for (int k = begin_of(vr[i]); k < end_of(vr[i]); k++)
             if (!accepts(instance, call, k, number_in(type, values, checked++)))
                 return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int k = INDEX[vr[i]]; k < INDEX[vr[i] + 1]; k++)
+        for (int k = begin_of(vr[i]); k < end_of(vr[i]); k++)
             set(instance, k, number_in(type, values, n++));
     return OK;
 }

@@ -133,14 +133,14 @@ FMI2_Export void probe_differentiate(const double value[], const int held[], con
     }
 }
 
-/* The derivatives of q̈ with respect to states and inputs, N_JOINTS rows. */
+/* The derivatives of q̈ with respect to states and inputs, a row for each of them. */
 FMI2_Export void probe_slopes(double value[], const int held[], const int slip[], double slope[])
 {
     Stops stops = {.any_held = 1, .any_slip = 1, .rank = rank_of(value)};
     memcpy(stops.held, held, sizeof stops.held);
     memcpy(stops.slip, slip, sizeof stops.slip);
     compute_rates((Plant *)value, &stops);
-    acceleration_slopes((const Plant *)value, &stops, (double(*)[X])slope);
+    acceleration_slopes((const Plant *)value, &stops, (double(*)[N_JOINTS])slope);
 }
 
 /* All computed variables. */

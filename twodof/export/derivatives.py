@@ -1,9 +1,9 @@
 """Terms of the derivatives of inverse dynamics as recursions over a robot's joints.
 
 Spatial vectors are in the root's axes about the task frame's origin, where rounding errors are small for distal joints.
-Motion vectors are (angular, linear), force vectors (moment, force). For each joint, s is its unit velocity, v and a are
-the velocity and the acceleration of the body before it, and I, B and f are the inertia, the Coriolis matrix and the
-wrench of all bodies that it moves:
+Motion vectors are (angular, linear), force vectors (moment, force). For each joint, s is its velocity at the unit
+velocity of the independent joint that it follows, v and a are the velocity and the acceleration of the body before it,
+and I, B and f are the inertia, the Coriolis matrix and the wrench of all bodies that it moves:
 
     ψ = v × s,   χ = a × s + v × ψ,                    I = Σ I_k,   B = Σ B_k,   f = Σ (I_k a_k + v_k ×* I_k v_k)
     ∂τ_i/∂q_j = sᵢᵀ (2 B_i ψ_j + I_i χ_j)              ∂τ_j/∂q_i = sⱼᵀ (2 B_i ψ_i + I_i χ_i + sᵢ ×* f_i)
@@ -28,7 +28,8 @@ def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: A
     Gravity is an upward acceleration of the root.
     """
     local, offsets = placements(robot, joint)
-    rates, accelerations = robot.G.dot(v), robot.G.dot(a)
+    follows = (robot.G != 0.0).astype(float)
+    rates, accelerations, ratios = follows.dot(v), follows.dot(a), robot.G.sum(axis=1)
     rotations: list[Array] = []
     origins: list[Array] = []
     for R, p, parent in zip(local, offsets, robot.parent):
@@ -41,7 +42,7 @@ def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: A
     root = np.array([0.0, 0.0, 0.0, *-gravity])
     for i, parent in enumerate(robot.parent):
         origins[i] = origins[i] - x
-        z, zero = rotations[i][:, 2], np.zeros(3)
+        z, zero = rotations[i][:, 2] * ratios[i], np.zeros(3)
         s = np.array([*zero, *z] if robot.prismatic[i] else [*z, *cross(origins[i], z)])
         velocity, acceleration = motions[parent][3:] if parent >= 0 else (np.zeros(6), root)
         psi = _motion_cross(velocity, s)

@@ -46,7 +46,8 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     effort = inverse_dynamics(constants, bodies, joint, armature, v, a, gravity)
     bounds = np.abs(effort), effort_bounds(constants, bodies, joint, armature, v, a, gravity)
     in_all = "const JointPosition joint[N_BODIES]"
-    motion = f"{in_all}, {INERTIAS}, const double v[N_JOINTS], const double a[N_JOINTS], const double gravity[3]"
+    moved = "const double v[N_JOINTS], const double a[N_JOINTS], const double gravity[3]"
+    motion = f"{in_all}, {INERTIAS}, {moved}"
     functions = {
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
         f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements("tau", J[:3].T.dot(force)),
@@ -62,21 +63,28 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         c_function(f"void {head}", results, varied(results.values(), held=held)) for head, results in functions.items()
     ]
     texts += _forward_dynamics(constants, bodies, joint, armature, in_all, held)
+    texts += ["#ifndef IS_COMPLEX", _tree(constants, rows[: len(robot.axes)])]
     motions = joint_motions(constants, joint, v, a, gravity)
-    terms = _terms("motion", ("s", "psi", "chi"), motions)
-    terms |= _terms("force", ("coriolis", "inertial", "by_q", "by_v"), joint_forces(constants, bodies, motions))
-    slopes = c_function(f"void joint_forces({motion}, JointMotion motion[N_BODIES], JointForce force[N_BODIES])", terms)
-    return "\n".join(
-        [MECHANISM, *texts, "#ifndef IS_COMPLEX", _tree(constants, rows[: len(robot.axes)]), slopes + "#endif\n"]
-    )
+    terms = _terms("motion", ("s", "psi", "chi", "velocity", "acceleration", "R", "origin"), motions)
+    computed = iter(Expression(name) if isinstance(value, Expression) else value for name, value in terms.items())
+    motions = [np.array([next(computed) for _ in rows.flat], dtype=object).reshape(rows.shape) for rows in motions]
+    derived = {
+        f"joint_motions({in_all}, {moved}, JointMotion motion[N_BODIES])": terms,
+        "joint_forces(const EndBody *end_body, const JointMotion motion[N_BODIES], JointForce force[N_BODIES])": _terms(
+            "force", ("coriolis", "inertial", "by_q", "by_v"), joint_forces(constants, bodies, motions)
+        ),
+        f"mass_matrix({in_all}, {INERTIAS}, double M[N_JOINTS][N_JOINTS])": _elements(
+            "M", mass_matrix(constants, bodies, joint, armature)
+        ),
+    }
+    texts += [c_function(f"void {head}", results) for head, results in derived.items()]
+    return "\n".join([MECHANISM, *texts, "#endif\n"])
 
 
 def _tree(robot: JointTree, axes: Sequence[int]) -> str:
-    """Return the joints' parents, of each the independent joint that it follows by a ratio, and the task's axes."""
-    leaders = np.abs(robot.G).argmax(axis=1)
-    ratios = robot.G[range(len(leaders)), leaders]
-    rows = {"int PARENT": robot.parent, "int LEADER": leaders.tolist(), "double RATIO": ratios.tolist()}
-    lines = [f"static const {name}[N_BODIES] = {{{', '.join(map(repr, row))}}};" for name, row in rows.items()]
+    """Return the joints' parents, of each the independent joint that it follows, and the task's axes."""
+    rows = {"PARENT": robot.parent, "LEADER": np.abs(robot.G).argmax(axis=1)}
+    lines = [f"static const int {name}[N_BODIES] = {{{', '.join(map(str, row))}}};" for name, row in rows.items()]
     lines.append(f"static const int AXIS[N_AXES] = {{{', '.join(map(str, axes))}}};")
     return "\n".join([*lines, f"enum {{ END_BODY = {robot.path[-1]} }};"])
 
@@ -84,9 +92,9 @@ def _tree(robot: JointTree, axes: Sequence[int]) -> str:
 def _terms(name: str, fields: Sequence[str], values: Sequence[Array]) -> dict[str, Value]:
     """Return the elements of the fields of an array of structs."""
     return {
-        f"{name}[{i}].{field}[{k}]": each
+        f"{name}[{i}].{field}" + "".join(f"[{k}]" for k in index): each
         for field, rows in zip(fields, values)
-        for (i, k), each in np.ndenumerate(rows)
+        for (i, *index), each in np.ndenumerate(rows)
     }
 
 
