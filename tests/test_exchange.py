@@ -585,6 +585,27 @@ def test_a_change_of_anything_gives_another_jacobian(fmus, change):
     assert np.abs(jacobian() - before).max() > 1e-3
 
 
+def test_after_a_point_with_several_directions_the_first_one_is_a_column_of_the_jacobian(fmus):
+    """A column of the Jacobian is bit-identical each time; a complex step rounds otherwise."""
+    model = Model(fmus["joint"], v_start=[0.5, -0.4], tau_ext=[0.1, 0.2])
+    model.go()
+    unknown = [model.vr[f"der(v[{i}])"] for i in (1, 2)]
+
+    def column(known):
+        return model.getDirectionalDerivative(unknown, [model.vr[known]], [1.0])
+
+    for k in range(6):
+        model.y = [0.1 * k, 0.2, 0.5, -0.3 * k]
+        first = column("q[2]")
+        column("q[1]")
+        assert k == 0 or first == column("q[2]")
+    for k in range(2):  # after a point with one direction, the first one is a complex step
+        model.y = [0.3, 0.2 + 0.1 * k, 0.7, 0.1]
+        first = column("q[2]")
+    column("q[1]")
+    assert first != column("q[2]")
+
+
 def test_a_derivative_of_a_variable_without_one_is_refused(fmus):
     model = Model(fmus["task"])
     call, vr = "getDirectionalDerivative", model.vr

@@ -62,16 +62,14 @@ static int has_slopes(Instance *instance, int several, const Request *request)
     for (size_t i = 0; i < request->n_given && COMMANDS_ACCELERATION && !reactions; i++)
         if (begin_of(request->given[i]) < TAU_EXT)
             return 0;
-    if (!(state->has_rates & SLOPES)) {
-        several |= state->has_rates & DIRECTION;
-        if (several || reactions || instance->asks_several) {
-            update_rates(state);
-            acceleration_slopes(&state->plant, &state->stops, instance->slope);
-            state->has_rates |= SLOPES;
-        }
-        state->has_rates |= DIRECTION;
-        instance->asks_several = several != 0;
+    several |= state->has_rates & DIRECTION;
+    if (!(state->has_rates & SLOPES) && (several || reactions || instance->asks_several)) {
+        update_rates(state);
+        acceleration_slopes(&state->plant, &state->stops, instance->slope);
+        state->has_rates |= SLOPES;
     }
+    state->has_rates |= DIRECTION;
+    instance->asks_several = several != 0;
     return state->has_rates & SLOPES;
 }
 
@@ -98,7 +96,7 @@ static int are_within(const Reference vr[], size_t count, int first, int end, co
 
 /* Compute the derivatives of rates, if they are products with a known Jacobian. Return 0 if the request needs anything
    else, or if a result is not finite. */
-static int multiply(const Instance *instance, const Request *request, const double seed[], size_t n_seed,
+static int multiply(Instance *instance, const Request *request, const double seed[], size_t n_seed,
                     double result[], size_t n_result)
 {
     const int first = COMMANDS_ACCELERATION ? TAU_EXT : 0;
@@ -108,6 +106,7 @@ static int multiply(const Instance *instance, const Request *request, const doub
         || !are_within(request->unknown, request->n_unknown, DER_Q, END_OF_RATES, result, n_result)
         || !are_within(request->given, request->n_given, first, X, seed, n_seed))
         return 0;
+    instance->asks_several = 1;
     for (size_t i = 0; i < request->n_given; i++)
         for (int k = begin_of(request->given[i]); k < end_of(request->given[i]); k++)
             add_column(instance, k, *seed++, rate);
