@@ -214,7 +214,7 @@ static int set_efforts(const double value[N_VARIABLES], const JointPosition join
 
 /* The derivatives of q̈ with respect to efforts and states, and with reactions also to inputs of the law: a row for each
    variable, by its index, at a plant with the derivatives of compute_rates. */
-static void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[X][N_JOINTS])
+INTERNAL void acceleration_slopes(const Plant *plant, const Stops *stops, double slope[X][N_JOINTS])
 {
     const double *value = plant->value, *v = &value[V];
     double a[N_JOINTS], acts[N_JOINTS] = {0}, reaction[N_JOINTS] = {0}, effort[X][N_JOINTS];

@@ -175,9 +175,9 @@ INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const do
 
 #ifndef IS_COMPLEX
 /* q̈ with reactions that keep some joints at rest, and the reactions, which act on all joints; else as acceleration. */
-static void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                                 const int slip[N_JOINTS], int rank, const int rests[N_JOINTS], double a[N_JOINTS],
-                                 double reaction[N_JOINTS], double *margin)
+INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                                   const int slip[N_JOINTS], int rank, const int rests[N_JOINTS], double a[N_JOINTS],
+                                   double reaction[N_JOINTS], double *margin)
 {
     JointPosition joint[N_BODIES];
     EndBody end_body;

@@ -166,7 +166,7 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
 }
 
 /* Fraction of the times within which events at rigid stops are one: they shrink with rtol below its default. */
-static double coarseness(const Plant *plant)
+INTERNAL double coarseness(const Plant *plant)
 {
     return fmin(1.0, plant->value[RTOL] / USUAL_RTOL);
 }
@@ -264,8 +264,8 @@ static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *
    restrain, margin that of acceleration. Resting joints in kept stay at rest even if the holding effort exceeds its
    bounds. Joints whose motion friction or a rigid stop ends within a window, s, stop at once: the window is that of an
    impact, and otherwise 0. */
-static void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
-                        Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
+INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
+                          Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
     const double *v = y + N_JOINTS;
@@ -315,7 +315,7 @@ static void find_regime(const Plant *plant, double y[N_STATES], const int kept[N
 
 /* Distance of a joint's holding effort from its lower (side −1) or upper (side 1) bound; HUGE_VAL without a bound. A
    watched joint is released if one is negative. */
-static double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side)
+INTERNAL double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side)
 {
     const double friction = stops->held[i] == CLAMPED ? 0.0 : plant->value[FRICTION + i];
     if (stops->held[i] != STUCK && is_above(plant, q, i) == (side < 0))
@@ -324,7 +324,7 @@ static double grip(const Plant *plant, const Stops *stops, int i, double q, doub
 }
 
 /* Bound on the rounding error of the holding efforts. */
-static double rounding_of(const Stops *stops, const double effort[N_JOINTS])
+INTERNAL double rounding_of(const Stops *stops, const double effort[N_JOINTS])
 {
     double largest = 0.0;
     for (int i = 0; i < N_JOINTS; i++)
