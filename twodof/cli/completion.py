@@ -2,10 +2,7 @@
 
 import argparse
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
-
-Completer = Callable[..., list[str]]
 
 
 def _file(options: argparse.Namespace) -> Path | None:
@@ -15,19 +12,15 @@ def _file(options: argparse.Namespace) -> Path | None:
     return Path(first[0] if isinstance(first, list) else first) if first else None
 
 
-def variables(suffix: str = "=") -> Completer:
-    """Return a completer of an FMU's inputs and parameters."""
+def variables(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Complete an FMU's inputs and parameters."""
+    path = _file(parsed_args)
+    if path is None or path.suffix != ".fmu":
+        return []
+    from ..fmu import load_fmu
 
-    def complete(parsed_args: argparse.Namespace, **_: object) -> list[str]:
-        path = _file(parsed_args)
-        if path is None or path.suffix != ".fmu":
-            return []
-        from ..fmu import load_fmu
-
-        fmu = load_fmu(path)
-        return [f"{group}{suffix}" for causality in ("input", "parameter") for group in fmu.groups(causality)]
-
-    return complete
+    fmu = load_fmu(path)
+    return [f"{group}=" for causality in ("input", "parameter") for group in fmu.groups(causality)]
 
 
 def links(parsed_args: argparse.Namespace, **_: object) -> list[str]:

@@ -3,12 +3,11 @@
 import argparse
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 from ..errors import choice, nearest
 from ..plant.numerals import number, whole_number
-from .completion import Completer
 from .printing import plain
 
 EXAMPLES = {
@@ -110,7 +109,7 @@ class Parser(argparse.ArgumentParser):
         self.register("type", int, whole_number)
         self._optionals.title = "options (defaults in parentheses)"
 
-    def add_argument(self, *names: str, completer: Completer | None = None, **named: Any) -> argparse.Action:
+    def add_argument(self, *names: str, completer: Callable[..., Any] | None = None, **named: Any) -> argparse.Action:
         """Add an argument whose values the shell completes by ``completer``."""
         action = super().add_argument(*names, **named)
         if completer is not None:

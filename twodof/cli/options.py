@@ -55,7 +55,7 @@ OF_A_RUN: Table = {
         dest="settings",
         metavar="NAME=VALUE",
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
-        completer=completion.variables(),
+        completer=completion.variables,
         action="append",
         default=[],
     ),

@@ -43,7 +43,7 @@ def add(sweep: Parser) -> None:
     )
     option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
     add_fmu(sweep, "the default arm's", "FMU")
-    varied = partial(sweep.add_repeatable, completer=variables())
+    varied = partial(sweep.add_repeatable, completer=variables)
     text = "evenly spaced values; several variables give all combinations"
     varied("--grid", dest="grids", metavar="NAME=LOW:HIGH:COUNT", help=text)
     option("--random", type=int, metavar="N", help="number of random draws from the --range options")
