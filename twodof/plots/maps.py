@@ -18,7 +18,7 @@ from ..bag.reader import read_bag
 from ..errors import BagError
 from ..sweeps.ranking import METRICS, beyond_limits
 from .interactive import figures_html
-from .settings import UNITS
+from .settings import WRITTEN
 from .strokes import downsampled
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
     content = {
         "varied": [*varied],
         "metrics": {name: METRICS[name].title for name in metrics},
-        "units": {**table.attrs["units"], **{name: UNITS.get(name, "") for name in varied if name in UNITS}},
+        "units": {name: WRITTEN.get(unit, unit) for name, unit in table.attrs["units"].items()},
         "columns": columns,
         "outcome": rows["outcome"].tolist(),
         "beyond": beyond_limits(rows).tolist(),
