@@ -125,6 +125,18 @@ DATABASES = {
         "DROP TABLE messages;CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
         "has views, triggers or virtual tables",
     ),
+    "two of one name, of which the first is a view": (
+        "PRAGMA writable_schema = ON; DELETE FROM sqlite_master WHERE name = 'messages';"
+        "INSERT INTO sqlite_master VALUES ('view', 'messages', 'messages', 0,"
+        f" 'CREATE VIEW messages AS {COUNT} SELECT n AS id, 1 AS topic_id, n AS timestamp, x''00'' AS data FROM c');"
+        "INSERT INTO sqlite_master VALUES ('table', 'messages', 'messages', 3, 'CREATE TABLE other (a)')",
+        "has views, triggers or virtual tables",
+    ),
+    "a view whose statement is bytes": (
+        "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'view', rootpage = 0, sql ="
+        f" CAST('CREATE VIEW messages AS {COUNT} SELECT n AS id FROM c' AS BLOB) WHERE name = 'messages'",
+        "has views, triggers or virtual tables",
+    ),
     "messages that are computed": (
         "DROP TABLE messages;"
         f"CREATE TABLE messages {MESSAGES[:-1]} AS (zeroblob(1000000000)));"

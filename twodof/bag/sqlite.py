@@ -78,11 +78,11 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.execute("PRAGMA writable_schema = ON")  # reads files that lack their end
             database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
-            schema = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"))
+            schema = [*database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL")]
             database.set_progress_handler(None, 0)
-            if not schema.keys() >= {"topics", "messages"}:
+            if not {name for name, _ in schema} >= {"topics", "messages"}:
                 raise DamageError(f"'{path.name}' has no messages")
-            if not all(sql.startswith(PLAIN) for sql in schema.values()):
+            if not all(isinstance(sql, str) and sql.startswith(PLAIN) for _, sql in schema):  # names may repeat
                 raise DamageError(f"'{path.name}' has views, triggers or virtual tables")
             yield database
 
