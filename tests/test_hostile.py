@@ -329,6 +329,17 @@ def test_hostile_urdf_is_refused(hostile_urdf, jail):
     refused(jail, reason, *build_command(jail, make()))
 
 
+def test_similar_names_are_searched_in_bounded_time(jail):
+    """The time to compare two names grows with the cube of their length if one of them repeats its letters."""
+    names = [f"{'aab' * 64}{i:07}" for i in range(500)]
+    joints = (
+        f'<joint name="{name}" type="fixed"><parent link="base"/><child link="{name}"/></joint>' for name in names
+    )
+    urdf = jail.input / "x.urdf"
+    urdf.write_text(robot(tip(), *(f'<link name="{name}"/>' for name in names), *joints))
+    refused(jail, "no frame 'a*' in the URDF", "build", urdf, "--frame", "a" * 199, "-o", jail.target / "x.fmu")
+
+
 def build_command(jail: Jail, text: str) -> list[object]:
     meshes(jail.input)
     urdf = jail.input / "x.urdf"

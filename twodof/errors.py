@@ -10,12 +10,14 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from contextlib import suppress
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
+from heapq import nlargest
 from itertools import islice
 from os import PathLike, scandir
 from pathlib import Path
 
-MAX_COMPARED = 20_000_000  # product of the lengths of names that are compared with one another, in a second
+MAX_COMPARED = 2_000_000  # characters of all names that are compared with one, in a second
+LIKELY, LONGEST = 100, 100  # of these, names in which also the order counts, and characters, whose cube is the time
 MAX_LISTED = 4000  # characters of the names in a message
 MOST_NEIGHBOURS = 1000  # files of a folder among which the nearest name is searched
 KINDS = {
@@ -112,11 +114,17 @@ def step_failure(k: int, t: float, error: SimulationError, remark: str = "") -> 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
     """Return the most similar known name, ignoring case; None without a similar one, or with too many to compare."""
-    known = [*known]
-    if len(name) * sum(map(len, known)) > MAX_COMPARED:
+    by_lower = {each.lower(): each for each in reversed([*known]) if len(each) <= LONGEST}
+    if len(name) > LONGEST or sum(map(len, by_lower)) > MAX_COMPARED:
         return None
-    by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
-    near = get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
+    matcher = SequenceMatcher(b=name.lower())
+
+    def share_of_letters(candidate: str) -> float:
+        matcher.set_seq1(candidate)
+        return matcher.quick_ratio()
+
+    likely = nlargest(LIKELY, by_lower, key=share_of_letters)
+    near = get_close_matches(name.lower(), likely, n=1, cutoff=cutoff)
     return by_lower[near[0]] if near else None
 
 

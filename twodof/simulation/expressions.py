@@ -4,7 +4,6 @@ Numbers, names, + − * / **, comparisons, and abs, min and max of two values.
 """
 
 import ast
-import difflib
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, nearest
 
 LONGEST = 500  # characters
 OPERATORS: dict[object, Callable[..., Any]] = {
@@ -73,9 +72,8 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
         raise InputError(f"'{text:.100}' has no number of a run; there are: {', '.join(known)}")
     for name in names:
         if not full_name(name, known):
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-            begun = [each for each in known if each.startswith(name)]
-            hint = f"did you mean {' or '.join(begun or near)}?" if begun or near else f"there are: {', '.join(known)}"
+            near = " or ".join(each for each in known if each.startswith(name)) or nearest(name, known, 0.4)
+            hint = f"did you mean {near}?" if near else f"there are: {', '.join(known)}"
             raise InputError(f"'{text:.100}': there is not a number '{name:.50}'; {hint}")
     full = {name: full_name(name, known) for name in names}
 
