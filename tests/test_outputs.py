@@ -115,6 +115,18 @@ def test_a_file_that_is_replaced_keeps_its_mode(umask, tmp_path):
         path.chmod(0o600)
 
 
+@pytest.mark.needs("root")
+def test_a_file_of_another_user_does_not_give_its_mode(umask, tmp_path):
+    """Otherwise this user could write into the new file."""
+    umask(0o077)
+    path = tmp_path / "file"
+    path.write_bytes(OLD)
+    path.chmod(0o666)
+    os.chown(path, 65534, 65534)
+    write_file(path, NEW)
+    assert (mode(path), path.stat().st_uid) == (0o600, os.geteuid())
+
+
 def test_pipes_and_devices_are_written_to(tmp_path):
     pipe, link, null = tmp_path / "pipe", tmp_path / "link", tmp_path / "null"
     os.mkfifo(pipe)

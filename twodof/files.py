@@ -158,11 +158,11 @@ class _Directory(io.BufferedReader):
 def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file atomically, following links; or write into a device, pipe or /dev/stdout; or raise OSError.
 
-    The umask sets the mode of a new file; a replaced file keeps its mode.
+    The umask sets the mode of a new file; a replaced file of this user keeps its mode.
     """
-    descriptor, target, mode = descriptor_of(path), target_of(path), 0
+    descriptor, target, mode, own = descriptor_of(path), target_of(path), 0, True
     with suppress(FileNotFoundError):
-        mode = os.stat(path).st_mode
+        mode, own = (state := os.stat(path)).st_mode, state.st_uid == os.geteuid()
     if descriptor is not None or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):
         with open(path if descriptor is None else os.dup(descriptor), "wb") as file:
             file.writelines([content] if isinstance(content, bytes) else content)
@@ -173,7 +173,7 @@ def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
     new = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:
         with open(new, "wb") as file:
-            if mode:
+            if mode and own:
                 os.fchmod(new, stat.S_IMODE(mode) & 0o777)
             file.writelines([content] if isinstance(content, bytes) else content)
         os.replace(partial, target)
@@ -184,7 +184,7 @@ def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
 
 def descriptor_of(path: str | Path) -> int | None:
     """Return the descriptor of a name such as /dev/stdout or /dev/fd/3; None for other paths."""
-    names = [it.name for it in _names(path) if it.parent == Path(f"/proc/{os.getpid()}/fd")]
+    names = [it.name for it in names_of(path) if it.parent == Path(f"/proc/{os.getpid()}/fd")]
     return next((int(name) for name in names if name.isdecimal()), None)
 
 
@@ -193,14 +193,14 @@ def target_of(path: str | Path) -> Path:
 
     In a sticky folder for all users, such as /tmp, links of other users are refused: they could name any file.
     """
-    for name in _names(path):
+    for name in names_of(path):
         folder, owner = name.parent.stat(), name.lstat().st_uid if name.is_symlink() else os.geteuid()
         if folder.st_mode & 0o1002 == 0o1002 and owner not in (os.geteuid(), folder.st_uid):
             raise PermissionError(errno.EACCES, f"'{name}' is a link of another user in a shared folder")
     return Path(os.path.realpath(path))
 
 
-def _names(path: str | Path) -> Iterator[Path]:
+def names_of(path: str | Path) -> Iterator[Path]:
     """Yield a path and the targets of its links in turn, each with the real path of its folder."""
     for _ in range(MAX_LINKS_FOLLOWED):
         yield (path := Path(os.path.realpath(Path(path).parent), Path(path).name))
