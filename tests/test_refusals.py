@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 import shutil
 import stat
@@ -359,6 +360,40 @@ def test_damaged_default_fmu_is_built_again(folder, fmu_path, capfd):
     assert (folder / "TwoDof.fmu").read_bytes() == fmu_path.read_bytes()
     said = "no FMU is named: using TwoDof.fmu, the default planar arm\n"
     assert capfd.readouterr().err == said
+
+
+OTHER = 65534
+OWNERS = {  # mode, owner and group of the folder, then of the FMU; whether it is run
+    "own": ((0o755, 0, 0), (0o644, 0, 0), True),
+    "of the own group": ((0o775, 0, 0), (0o664, 0, 0), True),
+    "own, in a folder such as /tmp": ((0o1777, 0, 0), (0o644, 0, 0), True),
+    "of another user in a folder such as /tmp": ((0o1777, 0, 0), (0o644, OTHER, OTHER), False),
+    "in a folder that all may write": ((0o777, 0, 0), (0o644, 0, 0), False),
+    "in a folder that another group may write": ((0o775, 0, OTHER), (0o644, 0, 0), False),
+    "in a folder of another user": ((0o755, OTHER, OTHER), (0o644, 0, 0), False),
+    "that all may write": ((0o755, 0, 0), (0o666, 0, 0), False),
+}
+
+
+@pytest.mark.needs("root")
+@pytest.mark.parametrize(("of_folder", "of_fmu", "runs"), OWNERS.values(), ids=OWNERS)
+def test_an_fmu_that_others_could_replace_after_its_check_is_not_run(of_folder, of_fmu, runs, folder, fmu_path, capsys):
+    shutil.copy(fmu_path, folder / "TwoDof.fmu")
+    for path, (mode, owner, group) in {folder: of_folder, folder / "TwoDof.fmu": of_fmu}.items():
+        os.chown(path, owner, group)
+        path.chmod(mode)
+    assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == (0 if runs else 2)
+    assert ("other users can change or replace" in capsys.readouterr().err) != runs
+    assert (folder / "bag").exists() == runs
+
+
+@pytest.mark.needs("root")
+def test_an_fmu_behind_a_link_of_another_user_is_not_run(folder, fmu_path):
+    folder.chmod(0o1777)
+    (folder / "TwoDof.fmu").symlink_to(fmu_path)
+    os.lchown(folder / "TwoDof.fmu", OTHER, OTHER)
+    assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 2
+    assert not (folder / "bag").exists()
 
 
 def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(folder, native_path, capfd):

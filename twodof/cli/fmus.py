@@ -1,10 +1,16 @@
 """The FMU that a command line names, built on demand."""
 
 import argparse
+import grp
+import os
+import pwd
+import stat
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..errors import BuildError
+from ..files import names_of
 from .options import CommandLineError
 from .printing import busy, quote, say
 
@@ -73,4 +79,27 @@ def _built(overwrite: bool = False, **what: Any) -> Path:
         from ..export.fmu_options import FmuOptions
         from ..export.package import build_fmu
 
-        return build_fmu(None, FmuOptions(**what), overwrite=overwrite)
+        path = build_fmu(None, FmuOptions(**what), overwrite=overwrite)
+    _check_own(path)
+    return path
+
+
+def _check_own(path: Path) -> None:
+    """Refuse a file that another user could change or replace between its build and its use."""
+    own = {os.geteuid(), 0}
+    for name in names_of(path):
+        folder, file = name.parent.stat(), name.lstat()
+        shared = _is_shared(folder) and not folder.st_mode & stat.S_ISVTX
+        if not {folder.st_uid, file.st_uid} <= own or shared or (_is_shared(file) and not name.is_symlink()):
+            raise CommandLineError(
+                f"other users can change or replace '{name}', and an FMU is a program:"
+                " work in a folder of your own, or name an FMU that you trust"
+            )
+
+
+def _is_shared(state: os.stat_result) -> bool:
+    """Return whether other users may write; a group with the user's name is the user's own."""
+    with suppress(KeyError):
+        if grp.getgrgid(state.st_gid).gr_name == pwd.getpwuid(os.geteuid()).pw_name:
+            return bool(state.st_mode & stat.S_IWOTH)
+    return bool(state.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
