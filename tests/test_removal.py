@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from functools import partial
 from math import cos, sin
@@ -81,7 +82,11 @@ def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
     ("fmu", "settings", "words"),
     [
         # a load and a target out of reach, which is more of the error
-        ("task", {"x_des": (1.0, 0.05), "payload": 0.3}, ["out of reach by 0.7012 m", "also .* payload of 0.3 kg"]),
+        (
+            "task",
+            {"x_des": (1.0, 0.05), "payload": 0.3},
+            ["out of reach by 0.7012 m", "payload of 0.3 kg .*; without both: 0.000"],
+        ),
         # a load that moves joints without a gain: the gain alone cures nothing
         ("joint", {"q_des": (0.9, 0.8), "Kp": 0.0, "f_ext": (0.0, -0.93, 0.0)}, ["know f_ext", "also Kp = 0"]),
         # joints are thrown to their limits by a wrong model; the small feedforward has no part
@@ -96,10 +101,14 @@ def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
         (
             "joint",
             {"q_des": (0.9, 0.8), "friction": (0.3, 0.1), "payload": 0.2},
-            ["payload of 0.2 kg", "also without it, joint 'joint1' creeps"],
+            ["payload of 0.2 kg", "also without the first cause: joint 'joint1' creeps"],
         ),
         # gains that are too slow for the duration show when the load is gone
-        ("task", {"payload": 1.0, "Kp": 15.0}, ["payload of 1 kg", "also without it, the position still approaches"]),
+        (
+            "task",
+            {"payload": 1.0, "Kp": 15.0},
+            ["payload of 1 kg", "also without the first cause: the position still approaches"],
+        ),
         (
             "pose",
             {"x_des": (0.4, 0.1, 0.4), "quat_des": (0.3, 0.9, 0.1, 0.2), "payload": 0.2, "Kp_rot": 5.0},
@@ -114,13 +123,62 @@ def test_several_causes_are_ranked_by_the_errors_without_each(fmus: dict[str, Pa
     assert "xd_des" not in " ".join(lines)
 
 
+@pytest.mark.parametrize(
+    ("fmu", "settings", "first"),
+    [
+        # friction holds a joint, and gains damp too little; the payload has nearly all of the error
+        ("system", {"plant.payload": 0.3, "friction": 0.1, "Kd": 0.3}, "payload of 0.3 kg .if it is known: 0.0"),
+        ("task", {"q_min": (-0.2, -3.0), "payload": 0.05}, "payload of 0.05 kg .if it is known: 0.09"),
+        # a noisy encoder with a small payload
+        (
+            "joint",
+            {"q_des": (0.9, 0.8), "control_period": 0.01, "q_noise": 0.2, "v_from_q": True, "payload": 0.05},
+            "acts with control_period = 0.01, q_noise = 0.2, v_from_q = 1",
+        ),
+    ],
+)
+def test_settings_that_the_forces_at_the_end_do_not_show_are_tried(fmus: dict[str, Path], fmu, settings, first) -> None:
+    assert re.search(first, twodof.simulate(fmus[fmu], settings=settings).verdict.lines[0])
+
+
+def test_the_first_cause_does_not_depend_on_the_communication_step(fmus: dict[str, Path]) -> None:
+    settings = {"x_des": (1.0, 0.05), "payload": 0.3}
+    lines = [twodof.simulate(fmus["task"], settings=settings, step=step).verdict.lines for step in (0.01, 0.001)]
+    assert all("out of reach by 0.7012 m (with a target in reach: 0.231 m)" in line[0] for line in lines)
+    assert all("(if it is known: 0.701 m; without both: 0.000" in line[1] for line in lines)
+
+
+def test_a_load_that_changes_is_absent_from_the_start(fmus: dict[str, Path], tmp_path: Path) -> None:
+    """The last change would otherwise leave the torque before it."""
+    (tmp_path / "a.csv").write_text("time,tau_ext[1],tau_ext[2]\n1,1,0.2\n4,0,0.2\n")
+    verdict = twodof.simulate(fmus["joint"], settings={"q_des": (0.9, 0.8)}, input_file=tmp_path / "a.csv").verdict
+    assert "(without it: 0.00073 rad)" in verdict.lines[0]
+
+
+def test_gains_that_are_far_too_slow_are_not_tried_for_hours(fmus: dict[str, Path]) -> None:
+    settings = {"Kp": 0.01, "Kd": 20.0}
+    verdict = twodof.simulate(fmus["task"], settings=settings, step=10.0, stop_time=10.0).verdict
+    assert [cause.tried for cause in verdict.causes if cause.kind == "time"] == [""]
+
+
+def test_a_run_with_a_locked_joint_has_a_verdict(fmus: dict[str, Path]) -> None:
+    verdict = twodof.simulate(fmus["task"], settings={"q_min": (0.0, 0.0), "q_max": (0.0, 3.0)}).verdict
+    assert verdict.outcome == "not reached" and verdict.causes
+
+
+def test_a_verdict_is_strict_json_if_a_repetition_diverges(fmus: dict[str, Path]) -> None:
+    settings = {"control_period": 0.1, "Kp": 300.0, "payload": 0.1, "q_des": (0.9, 0.8)}
+    verdict = twodof.simulate(fmus["joint"], settings=settings, stop_time=40.0).verdict
+    json.dumps(verdict.facts(), allow_nan=False)
+
+
 def test_causes_that_fail_only_together_keep_their_order(fmus: dict[str, Path]) -> None:
     both = {"q_des": (0.9, 0.8), "friction": 0.1, "payload": 0.1}
     sizes = [error(twodof.simulate(fmus["joint"], settings=both | one)) for one in ({}, {"payload_known": True})]
     verdict = twodof.simulate(fmus["joint"], settings=both).verdict
     assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
-    assert "payload of 0.1 kg (without it: 0.45 rad)" in verdict.lines[0]
-    assert "also without it, joint 'joint2' sticks" in verdict.lines[1]
+    assert "payload of 0.1 kg (if it is known: 0.45 rad)" in verdict.lines[0]
+    assert "also without the first cause: joint 'joint2' sticks" in verdict.lines[1]
 
 
 def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus: dict[str, Path], tmp_path: Path) -> None:
@@ -183,6 +241,6 @@ def test_a_bag_has_the_errors_without_the_causes(
     assert main(["run", str(fmus["task"]), "--set", "payload=0.3", "-o", str(bag)]) == 0
     printed = capsys.readouterr().out
     assert main(["info", str(bag)]) == 0
-    line = "(without it: 0.000224 m); set payload_known=true"
+    line = "(if it is known: 0.000224 m); set payload_known=true"
     assert line in printed and line in capsys.readouterr().out
     assert twodof.verdict(bag).causes[0].removes == pytest.approx(1.0, abs=0.01)

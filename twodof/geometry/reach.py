@@ -20,6 +20,7 @@ from .kinematics import Array, Kinematics
 SCATTERED, IMPROVED = 2000, 6  # starts, and those of them that are improved
 MOST_STEPS = 100  # of each start; robots of many joints converge slowly to poses out of reach
 LONGEST = 10.0  # m: range of starts for a prismatic joint without limits
+LOCKED = 1e-9  # rad or m: least range of a joint that the solver accepts
 EXACT = 1e-9  # m, rad: a solution within this distance of the target ends the search
 
 
@@ -72,6 +73,7 @@ def nearest(
     def slope(at: Array) -> Array:
         return np.asarray(kinematics.jacobian(link, at[None])[0][rows])
 
+    high = np.maximum(high, low + LOCKED)
     half = np.where(sliding, LONGEST, pi)
     ends = np.where(np.isfinite(low), low, q - half), np.where(np.isfinite(high), high, q + half)
     starts = np.random.default_rng(0).uniform(*ends, (SCATTERED, len(q)))

@@ -277,7 +277,8 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
             most = f"{bounds[i]:.4g} {EFFORT_UNITS.get(setup.units[i], '')} for {100 * judge.share[i]:.3g} %"
             payload = judge.held.get("payload")
             load = f", with the payload of {payload:g} kg" if payload else ""
-            text = f"the motor of joint '{joint}' was saturated at {most} of the time{load}"
+            remedy = "reduce the payload" if payload else "lower the gains"
+            text = f"the motor of joint '{joint}' was saturated at {most} of the time{load}; {remedy}"
             yield Cause("saturation", text, float(judge.share[i]), joint, float(t[inside[:, i].argmax()]))
 
 

@@ -26,7 +26,7 @@ GRAVITY = 9.81  # m/s²
 DRAG = 0.02  # effort of damping, relative to the largest effort in the last quarter, that counts
 
 
-def _gain(judge: Judge, group: str, i: int) -> str:
+def gain_name(judge: Judge, group: str, i: int) -> str:
     """Return the name of element i of a gain, and its direction or joint, unless all elements are equal."""
     values = judge.given(group)
     if len(values) > 1 and not np.ptp(values):
@@ -45,7 +45,9 @@ def gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         off = np.ones(len(values), bool)  # an orientation's error has no elements in the samples
         if name != "quat" and len(e := np.abs(judge.wanted(name) - judge.end(name))) == len(values):
             off = e >= OF_ERROR * e.max()
-        zero = list(dict.fromkeys(_gain(judge, group, i) for i, gain in enumerate(values) if gain == 0.0 and off[i]))
+        zero = list(
+            dict.fromkeys(gain_name(judge, group, i) for i, gain in enumerate(values) if gain == 0.0 and off[i])
+        )
         if zero:
             text = f"{', '.join(zero)} = 0: the controller does not reduce the error of the {error}; raise the gain"
             yield Cause("gain", text, 1.0)
@@ -71,16 +73,21 @@ def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("time", f"{text}; set {group}, raise {stiff} or lower {damp}", 0.5)
 
 
-def load(judge: Judge) -> Iterator[Cause]:
-    """Yield loads, and the damping of joints, that the controller does not know."""
+def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
+    """Yield loads, and the damping of joints, that the controller does not know.
+
+    Args:
+        judge: the judge of all samples.
+        slight: torque, relative to the largest effort, below which a load does not count.
+    """
     switch, (payload, believed) = "payload_known", payloads(judge)
     own = controller_prefix(judge)
-    if payload and believed != payload and (share := _share(judge, payload * GRAVITY * LEVER)) > SLIGHT:
+    if payload and believed != payload and (share := _share(judge, payload * GRAVITY * LEVER)) > slight:
         remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
         text = f"the controller does not know the payload of {payload:g} kg; {remedy}"
         yield Cause("load", text, share, subject="payload")
     elif believed and not payload:
-        text = f"the controller knows a payload of {believed:g} kg, which the plant does not have; set {own}payload=0"
+        text = f"the controller assumes a payload of {believed:g} kg, which the plant has not; set {own}payload=0"
         yield Cause("load", text, _share(judge, believed * GRAVITY * LEVER), subject="payload")
     for name in ("gravity", "payload_com", "armature"):
         real, model = judge.given(name), judge.given(own + name)
@@ -91,7 +98,7 @@ def load(judge: Judge) -> Iterator[Cause]:
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     drags = [_share(judge, d * speed) for d, speed in zip(judge.given("damping"), judge.speed)]
     given = zip(usual, judge.given("damping"), drags)
-    heavy = [name for name, d, share in given if d > 2.0 * usual[name] and share > SLIGHT]
+    heavy = [name for name, d, share in given if d > 2.0 * usual[name] and share > slight]
     each = heavy or [name for name in usual if usual[name] > 0.0]
     names = "of any joint" if len(each) == len(usual) > 2 else f"of joints {', '.join(map(repr, each))}"
     kind, tail, share = ("load", "", max(drags)) if heavy else ("drag", " in the URDF", 0.0)
@@ -100,8 +107,8 @@ def load(judge: Judge) -> Iterator[Cause]:
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
         values = judge.given(group)
         share = _share(judge, np.abs(values).max(initial=0.0) * (LEVER if group == "f_ext" else 1.0))
-        if share > SLIGHT:
-            text = f"the controller does not know {group} = {point_text(values)}{unit}"
+        if share > slight:
+            text = f"the controller does not know {group} = {point_text(values)}{unit}; raise Kp"
             yield Cause("load", text, share, subject=group)
 
 
@@ -155,6 +162,7 @@ def sampled(judge: Judge) -> Iterator[Cause]:
         sensors = ", ".join(sensors_of(judge, i))
         text = f"joint '{setup.joints[i]}' reverses every {setup.step / turns[i]:.2g} s: "
         text += f"{sensors}: too much for {gains} at {what}" if sensors else f"{gains} are too high for {what}"
+        text += "; lower the gains" + ", or take finer sensors" * bool(sensors)
         yield Cause("sampling", text, float(turns[i]), setup.joints[i])
 
 
@@ -192,7 +200,7 @@ def _fastest(judge: Judge, period: float, delay: float) -> str:
 
 def _named(judge: Judge, loop: _Loop, units: Sequence[str] = ("", "")) -> list[str]:
     """Return the gains of a loop with their names and values."""
-    names = [_gain(judge, name, loop.i) for name in (loop.stiff, loop.damp)] if loop.stiff else ["", loop.damp]
+    names = [gain_name(judge, name, loop.i) for name in (loop.stiff, loop.damp)] if loop.stiff else ["", loop.damp]
     return [f"{name} = {value:.6g}{unit}" for name, value, unit in zip(names, (loop.Kp, loop.Kd), units) if name]
 
 
@@ -270,7 +278,7 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
         ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
         if ratios and min(ratios)[0] < WEAK:
             ratio, i, p, d = min(ratios)
-            names = [_gain(judge, group, i) for group in (damp, stiff)]
+            names = [gain_name(judge, group, i) for group in (damp, stiff)]
             text = f"{names[0]} = {d:g} s⁻¹ damps {names[1]} = {p:g} s⁻² too little"
             yield Cause("damping", f"{text}: critical damping is {2.0 * sqrt(p):.4g} s⁻¹", 1.0 - ratio)
 

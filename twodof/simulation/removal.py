@@ -1,19 +1,21 @@
 """Order of the causes of a failed run, by the errors of repeated runs without each of them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from math import inf, radians, sqrt
+from math import inf, isfinite, radians, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from ..plant.urdf import UNBOUNDED
 from ..plant.variables import ROWS
-from .cause import FLOOR, FOLLOWING, SMALL, Cause
-from .controller_causes import GAINS, controller_prefix, payloads
+from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
+from .controller_causes import GAINS, controller_prefix, damping, feedforward, load, payloads
 from .judge import OF_THE_END, Judge
 from .setup import OF_THE_CONTROLLER
 
 LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
+LONGER = 10.0  # a run is repeated for at most this many times its duration more
+HALF = 0.5  # part of the error; if no cause removes as much, all other settings are tried
 WHOLE = 0.9  # part of the error whose removal explains all consequences
 TURN = 6.0  # rad: larger joint targets are in degrees, if one is
 SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
@@ -55,40 +57,84 @@ def by_removal(
         repeat: function that repeats the run.
         causes_of: function that returns the causes of a repeated run.
     """
-    if all(cause.noted or cause.kind in FOLLOWING for cause in why):
-        why = [*why, *_sampling(judge)]
-    plans = {cause.text: plan for cause in why if (plan := _without(judge, cause)) is not None}
-    each = [*dict.fromkeys(plans.values())]
-    results = {plan: result for plan, result in zip(each, repeat(each)) if result is not None}
-    tried = [_tried(cause, judge, missed, plans.get(cause.text), results) for cause in why]
-    most = max((cause.removes for cause in tried if cause.removes is not None), default=0.0)
+    trials = _Trials(judge, missed, repeat)
+    tried = trials.tried(why)
+    if _most(tried) < HALF:
+        tried += [cause for cause in trials.tried(_others(judge, missed, why)) if (cause.removes or 0.0) >= LITTLE]
+    most = _most(tried)
     if most >= LITTLE or any(map(_is_open, tried)):
-        left = max(0.0, 1.0 - most)
         counted = [_counted(cause, most) for cause in tried if cause.removes is None or abs(cause.removes) >= SMALL]
-        tried = sorted(counted, key=lambda cause: _rank(cause, left))
-    root = plans.get(tried[0].text) if tried else None
-    if root is None or root not in results:
+        tried = sorted(counted, key=lambda cause: _rank(cause, max(0.0, 1.0 - most)))
+    root = trials.without(tried[0]) if tried else None
+    if root is None:
         return tuple(tried)
     known = {(cause.kind, cause.joint, cause.subject) for cause in tried}
-    rest = [c for c in causes_of(results[root]) if not c.noted and (c.kind, c.joint, c.subject) not in known]
-    return *tried, *(cause._replace(text=f"{root.words}, {cause.text}", part=None) for cause in rest[:1])
+    rest = [c for c in causes_of(root) if not c.noted and (c.kind, c.joint, c.subject) not in known]
+    rest = [cause._replace(text=f"without the first cause: {cause.text}", part=None) for cause in rest[:1]]
+    return *trials.together(tried), *rest
 
 
-def _tried(
-    cause: Cause, judge: Judge, missed: Sequence[str], plan: Repetition | None, results: Mapping[Repetition, Judge]
-) -> Cause:
-    """Return a cause with the result of the run without it, if there is one."""
-    if plan is None or plan not in results:
-        return cause
-    removes = 1.0 - _size(results[plan], judge, missed) / _size(judge, judge, missed)
-    return cause._replace(tried=f"{plan.words}: {_errors(results[plan], missed)}", removes=removes)
+class _Trials:
+    """Repetitions of a run that missed outputs, and their results."""
+
+    def __init__(self, judge: Judge, missed: Sequence[str], repeat: Repeat) -> None:
+        self._judge, self._missed, self._repeat = judge, missed, repeat
+        self._plans: dict[str, Repetition] = {}
+        self._results: dict[Repetition, Judge] = {}
+
+    def tried(self, causes: Sequence[Cause]) -> list[Cause]:
+        """Return causes with the results of the runs without them, as far as there are some."""
+        plans = {cause.text: plan for cause in causes if (plan := _without(self._judge, cause)) is not None}
+        new = [plan for plan in dict.fromkeys(plans.values()) if plan not in self._results]
+        self._plans |= plans
+        for plan, result in zip(new, self._repeat(new)):
+            if result is not None and isfinite(self._size(result)):
+                self._results[plan] = result
+        return [self._with_result(cause) for cause in causes]
+
+    def _with_result(self, cause: Cause) -> Cause:
+        if (result := self.without(cause)) is None:
+            return cause
+        tried = f"{self._plans[cause.text].words}: {_errors(result, self._missed)}"
+        return cause._replace(tried=tried, removes=1.0 - self._size(result) / self._size(self._judge))
+
+    def without(self, cause: Cause) -> Judge | None:
+        """Return the judge of the run without a cause; None if there is none."""
+        plan = self._plans.get(cause.text)
+        return None if plan is None else self._results.get(plan)
+
+    def together(self, tried: list[Cause]) -> list[Cause]:
+        """Return the causes, the last of several with the errors of the run without all of them."""
+        each = [*dict.fromkeys(self._plans[cause.text] for cause in tried if cause.tried and not cause.noted)]
+        if len(each) < 2:
+            return tried
+        settings = dict(pair for plan in reversed(each) for pair in plan.settings)
+        (result,) = self._repeat([Repetition("", tuple(settings.items()), max(plan.longer for plan in each))])
+        if result is None:
+            return tried
+        words = f"; without {'both' if len(each) == 2 else 'all'}: {_errors(result, self._missed)}"
+        last = [cause.tried != "" and self._plans[cause.text] == each[-1] for cause in tried]
+        return [cause._replace(tried=cause.tried + words) if own else cause for cause, own in zip(tried, last)]
+
+    def _size(self, result: Judge) -> float:
+        """Return the sum of the RMS errors at the end of a run, relative to the largest errors of the first one."""
+        late = result.history() >= result.changed + (1.0 - OF_THE_END) * (result.duration - result.changed)
+        with np.errstate(over="ignore", invalid="ignore"):  # a repetition may diverge
+            rms = {name: float(np.sqrt(np.mean(result.error_history(name)[late] ** 2))) for name in self._missed}
+        largest = {name: max(float(self._judge.error_history(name).max()), FLOOR) for name in self._missed}
+        return sum(rms[name] / largest[name] for name in self._missed)
+
+
+def _most(tried: Sequence[Cause]) -> float:
+    """Return the largest part of the error that a cause removes."""
+    return max((cause.removes for cause in tried if cause.removes is not None), default=0.0)
 
 
 def _counted(cause: Cause, most: float) -> Cause:
     """Return a cause that is noted if it reduces the error, or follows from one that explains all of the error."""
     reduces = cause.removes is not None and cause.removes < 0.0
-    follows = cause.removes is None and (cause.noted or (cause.kind in FOLLOWING and most > WHOLE))
-    return cause._replace(noted=reduces or follows)
+    follows = cause.kind in FOLLOWING and most > WHOLE and cause.removes != most
+    return cause._replace(noted=reduces or follows or (cause.noted and cause.removes is None))
 
 
 def _is_open(cause: Cause) -> bool:
@@ -97,18 +143,11 @@ def _is_open(cause: Cause) -> bool:
 
 
 def _rank(cause: Cause, left: float) -> float:
-    """Return the place of a cause by what it removes, else by its part, else by what no other cause removes."""
+    """Return the place of a cause by what it removes, or of one that was not tried, by what no other cause removes."""
     if cause.noted:
         return inf
-    untried = cause.part if cause.part is not None else left if _is_open(cause) else 0.0
+    untried = left if _is_open(cause) else 0.0
     return -round(untried if cause.removes is None else cause.removes, 1)
-
-
-def _size(result: Judge, of: Judge, missed: Sequence[str]) -> float:
-    """Return the sum of the RMS errors at the end of a run, relative to the largest errors of another."""
-    late = result.history() >= result.changed + (1.0 - OF_THE_END) * (result.duration - result.changed)
-    rms = {name: sqrt(float(np.mean(np.square(result.error_history(name)[late])))) for name in missed}
-    return sum(rms[name] / max(float(of.error_history(name).max()), FLOOR) for name in missed)
 
 
 def _errors(result: Judge, missed: Sequence[str]) -> str:
@@ -123,12 +162,30 @@ def _errors(result: Judge, missed: Sequence[str]) -> str:
     return " and ".join(texts)
 
 
+def _others(judge: Judge, missed: Sequence[str], why: Sequence[Cause]) -> list[Cause]:
+    """Return settings as causes that the balance of forces at the end does not show, beside those known."""
+    known = {(cause.kind, cause.subject) for cause in why}
+    found = [
+        *load(judge, 0.0),
+        *feedforward(judge, missed),
+        *damping(judge, missed),
+        *_friction(judge),
+        *_sampling(judge),
+    ]
+    return [cause for cause in found if (cause.kind, cause.subject) not in known]
+
+
+def _friction(judge: Judge) -> Iterator[Cause]:
+    if judge.given("friction").any():
+        yield Cause("friction", f"the joints have the friction {point_text(judge.given('friction'))}; raise Kp")
+
+
 def _sampling(judge: Judge) -> Iterator[Cause]:
-    """Yield the settings of a sampled controller as a cause, for runs in which only consequences are seen."""
+    """Yield the settings of a sampled controller as a cause."""
     values = {group: judge.given(group) if f"{group}[1]" in judge.held else judge.held.get(group) for group in SAMPLING}
     named = [f"{group} = {np.max(np.asarray(value)):g}" for group, value in values.items() if np.any(np.asarray(value))]
     if named:
-        yield Cause("sampling", f"the controller acts with {', '.join(named)}", noted=True)
+        yield Cause("sampling", f"the controller acts with {', '.join(named)}")
 
 
 def _without(judge: Judge, cause: Cause) -> Repetition | None:
@@ -136,8 +193,9 @@ def _without(judge: Judge, cause: Cause) -> Repetition | None:
     held, own = judge.held, controller_prefix(judge)
 
     def plan(words: str, settings: Mapping[str, float]) -> Repetition | None:
-        changed = tuple((name, value) for name, value in settings.items() if held.get(name, value) != value)
-        return Repetition(words, changed) if changed else None
+        starts, inputs = judge.setup.starts, judge.inputs
+        changes = [name in inputs or starts.get(name, value) != value for name, value in settings.items()]
+        return Repetition(words, tuple(settings.items())) if any(changes) else None
 
     match cause.kind:
         case "friction":
@@ -145,7 +203,7 @@ def _without(judge: Judge, cause: Cause) -> Repetition | None:
         case "feedforward" | "drag":
             return plan("without it", _elements(held, cause.subject, 0.0))
         case "load":
-            return plan("without it", _known_load(judge, cause.subject))
+            return plan(*_known_load(judge, cause.subject))
         case "saturation":
             return plan("without this limit", {"limit_effort": False})
         case "limit":
@@ -161,11 +219,10 @@ def _without(judge: Judge, cause: Cause) -> Repetition | None:
         case "damping":
             return plan("with critical damping", _critical(judge))
         case "degrees":
-            large = {name: value for name, value in held.items() if name.startswith(("q_des[", "q_start["))}
-            return plan("read as degrees", {name: radians(value) for name, value in large.items() if abs(value) > TURN})
+            return plan("read as degrees", _in_radians(judge))
         case "reach" if not judge.wanted("quat").size and not judge.moving:
             return plan("with a target in reach", _in_reach(judge, cause))
-        case "time" if not judge.moving:
+        case "time" if not judge.moving and cause.share <= LONGER * judge.duration:
             return Repetition(f"at {judge.duration + cause.share:.4g} s", longer=cause.share)
     return None
 
@@ -175,16 +232,27 @@ def _elements(held: Mapping[str, float], group: str, value: float) -> dict[str, 
     return {name: value for name in held if name.partition("[")[0] == group}
 
 
-def _known_load(judge: Judge, subject: str) -> dict[str, float]:
-    """Return settings with which the controller knows a load, or without an external load."""
+def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
+    """Return settings with which the controller knows a load, or without an external load, in words first."""
     own, held = controller_prefix(judge), judge.held
     if subject == "payload":
         payload, _ = payloads(judge)
         known = {f"{own}payload_known": True, f"{own}payload": payload}
-        return known if payload or not own else {f"{own}payload": 0.0}
+        return ("if it is known", known) if payload or not own else ("without it", {f"{own}payload": 0.0})
     if own and f"{own}{subject}[1]" in held:
-        return {f"{own}{name}": held[name] for name in held if name.partition("[")[0] == subject}
-    return _elements(held, subject, 0.0)
+        model = [name for name in held if name.partition("[")[0] == subject]
+        return "with that of the plant", {f"{own}{name}": held[name] for name in model}
+    return "without it", _elements(held, subject, 0.0)
+
+
+def _in_radians(judge: Judge) -> dict[str, float]:
+    """Return large positions of revolute joints, read as degrees, in rad."""
+    return {
+        f"{group}[{i + 1}]": radians(value)
+        for group in ("q_des", "q_start")
+        for i, (value, unit) in enumerate(zip(judge.given(group), judge.setup.units))
+        if unit == "rad" and abs(value) > TURN
+    }
 
 
 def _raised(judge: Judge) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """Runs that are repeated with other settings, in memory."""
 
 import logging
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,14 +11,15 @@ from math import ceil
 from ..errors import FmuError, SimulationError
 from ..fmu import Fmu, Instance, System, SystemInstance, instantiate
 from ..fmu.instance import logger
-from ..signatures import ignore, never
+from ..signatures import ignore
 from .experiments import Experiment
 from .judge import Judge
 from .removal import Repetition
 from .setup import robot_of
-from .stepping import judge_of, stepped
+from .stepping import Stop, judge_of, stepped
 
-MOST_STEPS = 5000  # communication steps of the repetitions of a run
+MOST_STEPS = 5000  # communication steps of a run that is repeated
+PATIENCE = 10.0  # s of wall time for all repetitions at one time, which only steps that are slow beyond measure need
 
 
 def is_repeatable(run: Experiment) -> bool:
@@ -32,22 +34,13 @@ def _is_native(fmu: Fmu) -> bool:
 
 
 def repeated(run: Experiment, plans: Sequence[Repetition]) -> list[Judge | None]:
-    """Run an experiment again for each plan; return the judges.
-
-    A judge is None if the run failed, or if it needs more steps than MOST_STEPS leaves.
-    """
-    left: float = MOST_STEPS
-    judges = list[Judge | None]()
+    """Run an experiment again for each plan; return the judges, None for a run that failed or took too long."""
+    end = time.monotonic() + PATIENCE
     try:
         with instantiate(run.fmu) as instance, _without_messages():
-            for plan in plans:
-                again = _changed(run, plan)
-                within = again.steps <= left
-                left -= again.steps if within else 0
-                judges.append(_judged(again, instance) if within else None)
+            return [_judged(_changed(run, plan), instance, lambda: time.monotonic() > end) for plan in plans]
     except FmuError:  # the file was replaced meanwhile
         return [None] * len(plans)
-    return judges
 
 
 def _changed(run: Experiment, plan: Repetition) -> Experiment:
@@ -62,16 +55,16 @@ def _changed(run: Experiment, plan: Repetition) -> Experiment:
     )
 
 
-def _judged(run: Experiment, instance: Instance | SystemInstance) -> Judge | None:
+def _judged(run: Experiment, instance: Instance | SystemInstance, stop: Stop) -> Judge | None:
     judge = judge_of(run, robot_of(run.fmu.urdf))
     try:
-        deque(stepped(run, judge, None, never, ignore, ignore, instance), maxlen=0)
+        (last,) = deque(stepped(run, judge, None, stop, ignore, ignore, instance), maxlen=1)
     except SimulationError:
         return None
     finally:
         instance.reset()
     judge.flush()
-    return judge
+    return judge if last.k == run.steps else None
 
 
 @contextmanager

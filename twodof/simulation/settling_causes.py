@@ -7,7 +7,7 @@ import numpy as np
 
 from .aim import BAND
 from .cause import FLOOR, Cause
-from .controller_causes import OF_ERROR, PERIODS, decay, late_by, loops, rate_of, sensors_of
+from .controller_causes import OF_ERROR, PERIODS, decay, gain_name, late_by, loops, rate_of, sensors_of
 from .judge import OF_THE_END, Judge
 
 SWINGING = 0.7  # damping ratio below which an error that shrinks once will grow again
@@ -32,17 +32,29 @@ def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> It
         band = max(BAND * aim.first, FLOOR)
         left = log(max(aim.last / band, 1.0)) / rate if rate else 0.0
         left += OF_THE_END * (judge.duration - judge.changed)  # the error must stay there
-        what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
+        what = {name: f"the {output} still approaches" for name, output in (("x", "position"), ("quat", "orientation"))}
+        what["q"] = "the joints still approach"
+        raised, approaches = stiff, what[name]
+        if name == "q" and (i := _alone(judge)) is not None:
+            approaches, raised = f"joint '{judge.setup.joints[i]}' still approaches", gain_name(judge, stiff, i)
+            damp = gain_name(judge, damp, i)
         if rate and left < 1000.0 * judge.duration:
             late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
-            text = f"{late}the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
-            remedy = f"raise {stiff}, or lower {damp}" if max(ratios, default=0.0) > 1.0 else "raise the gains"
+            text = f"{late}{approaches}, with a time constant of {1.0 / rate:.3g} s"
+            remedy = f"raise {raised}, or lower {damp}" if max(ratios, default=0.0) > 1.0 else "raise the gains"
             if static.get(name, 0.0) > band:
                 text += ", and other causes keep an error"
             else:
                 text += f": 2 % takes about {left:.3g} s more"
                 remedy += ", or stop later"
             yield Cause("time", f"{text}; {remedy}", left)
+
+
+def _alone(judge: Judge) -> int | None:
+    """Return the index of the joint that has nearly all of the error; None if several have a part in it."""
+    e = np.abs(judge.wanted("q") - judge.end("q"))
+    others = np.delete(e, int(e.argmax()))
+    return int(e.argmax()) if others.size and others.max() < OF_ERROR * e.max() else None
 
 
 def _slowest(judge: Judge, name: str) -> float:

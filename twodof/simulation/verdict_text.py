@@ -7,7 +7,7 @@ import numpy as np
 
 from .aim import SMALLEST_MOVE
 from .cause import FLOOR, SMALL, Cause, point_text
-from .controller_causes import STILL
+from .controller_causes import STILL, controller_prefix
 from .judge import AT_LIMIT, Judge
 
 WHOLE = 0.995  # part of an error that is printed as the whole
@@ -15,7 +15,7 @@ MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is pr
 RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
 ERRORS = {"x": "position", "quat": "orientation", "q": "joints"}
-SWITCHES = ("payload_known", "limit_effort")
+SWITCHES = ("payload_known", "limit_effort", "v_from_q")
 CONTROLLER = {
     "Kp": "",
     "Kd": "",
@@ -24,8 +24,10 @@ CONTROLLER = {
     "control_period": " s",
     "control_delay": " s",
     "payload": " kg",
+    "f_ext": " N",
+    **dict.fromkeys(("tau_ext", "friction", "damping", "q_resolution", "q_noise", "v_noise"), ""),
 }
-"""Settings that the verdict of a run that failed names if they are not 0, and their units, without those of gains."""
+"""Settings that the verdict of a run that failed names if they are not 0; units without those of gains and joints."""
 
 
 def lines_of(
@@ -86,7 +88,9 @@ def _with_part(cause: Cause, several: bool) -> str:
 def _settings(judge: Judge) -> str:
     """Return the settings of the controller that are not 0 in words."""
     texts = []
-    for name, unit in {**CONTROLLER, **dict.fromkeys(SWITCHES, "")}.items():
+    own = controller_prefix(judge)
+    believed = {f"{own}payload": " kg"} if own else {}
+    for name, unit in {**CONTROLLER, **believed, **dict.fromkeys(SWITCHES, "")}.items():
         values = judge.given(name) if f"{name}[1]" in judge.held else np.array([float(judge.held.get(name, 0.0))])
         if values.any():
             value = f"{values[0]:.4g}" if np.ptp(values) == 0.0 else point_text(values)
@@ -114,8 +118,10 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     """Return settling, overshoot, RMS error and motion in words."""
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
-        firsts = [f"{aim.first:.3g} {_unit(judge, name)}" for name, aim in judge.aims.items()]
+        moves = {name: aim for name, aim in judge.aims.items() if aim.first >= FLOOR} or judge.aims
+        firsts = [f"{aim.first:.3g} {_unit(judge, name)}" for name, aim in moves.items()]
         late = f"not within 2 % of the initial error of {' and '.join(firsts)}"
+        late += ", farther from the target than at the start" * any(aim.last > aim.first for aim in moves.values())
         moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
         only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
         within = only if outcome == "not reached" else f"within 2 % after {settling:.4g} s"
