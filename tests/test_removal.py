@@ -73,7 +73,7 @@ def test_the_error_without_the_first_cause_is_that_of_a_run_without_it(
 
 def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
     first = twodof.simulate(fmus["task"], stop_time=1.0).verdict.lines[0]
-    left, tried, size = re.findall(r"about ([\d.]+) s more \(at ([\d.]+) s: ([\d.e-]+) m\)", first)[0]
+    left, tried, size = re.findall(r"about ([\d.]+) s more \(after ([\d.]+) s: ([\d.e-]+) m\)", first)[0]
     assert float(tried) == pytest.approx(1.0 + float(left), abs=0.01)
     assert float(size) <= 0.02 * twodof.simulate(fmus["task"], stop_time=1.0).judge.aims["x"].first
 
@@ -172,13 +172,37 @@ def test_a_verdict_is_strict_json_if_a_repetition_diverges(fmus: dict[str, Path]
     json.dumps(verdict.facts(), allow_nan=False)
 
 
-def test_causes_that_fail_only_together_keep_their_order(fmus: dict[str, Path]) -> None:
-    both = {"q_des": (0.9, 0.8), "friction": 0.1, "payload": 0.1}
-    sizes = [error(twodof.simulate(fmus["joint"], settings=both | one)) for one in ({}, {"payload_known": True})]
-    verdict = twodof.simulate(fmus["joint"], settings=both).verdict
-    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
-    assert "payload of 0.1 kg (if it is known: 0.45 rad)" in verdict.lines[0]
-    assert "also without the first cause: joint 'joint2' sticks" in verdict.lines[1]
+def test_causes_that_keep_the_error_only_together_are_all_named(fmus: dict[str, Path]) -> None:
+    """Without one of them the error is as large: friction holds one joint, and a torque would move the other."""
+    both = {"q_des": (0.9, 0.8), "friction": (0.1, 0.05), "tau_ext": (0.1, 0.0)}
+    still, smooth, without = (
+        error(twodof.simulate(fmus["joint"], settings=both | one))
+        for one in ({"tau_ext": 0.0}, {"friction": 0.0}, {"tau_ext": 0.0, "friction": 0.0})
+    )
+    text = str(twodof.simulate(fmus["joint"], settings=both).verdict)
+    assert f"(without friction: {smooth:.3g} rad" in text and f"(without it: {still:.3g} rad" in text
+    assert f"; without both: {without:.3g} rad)" in text
+    assert still > 0.4 and smooth > 0.4 and without < 1e-3
+
+
+def test_what_follows_from_degrees_is_a_note(fmus: dict[str, Path]) -> None:
+    lines = twodof.simulate(fmus["joint"], settings={"q_des": (90.0, 0.8)}).verdict.lines
+    assert "90° is 1.571 rad (read as degrees: 0.00174 rad)" in lines[0]
+    assert lines[1].startswith("note: joint 'joint1' stood at its upper limit")
+
+
+def test_inputs_after_the_end_are_not_played_in_a_longer_repetition(fmus: dict[str, Path]) -> None:
+    verdicts = [
+        twodof.simulate(fmus["task"], stop_time=1.0, changes=changes).verdict.lines[0]
+        for changes in ([], [(2.0, {"tau_ext[1]": 5.0})])
+    ]
+    assert verdicts[0] == verdicts[1]
+
+
+def test_a_target_that_changed_is_not_replaced_from_the_start(fmus: dict[str, Path]) -> None:
+    changes = [(4.5, {"x_des": (1.0, 0.05)})]
+    causes = twodof.simulate(fmus["task"], changes=changes).verdict.causes
+    assert [cause.tried for cause in causes if cause.kind == "reach"] == [""]
 
 
 def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus: dict[str, Path], tmp_path: Path) -> None:

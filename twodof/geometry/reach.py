@@ -21,6 +21,7 @@ SCATTERED, IMPROVED = 2000, 6  # starts, and those of them that are improved
 MOST_STEPS = 100  # of each start; robots of many joints converge slowly to poses out of reach
 LONGEST = 10.0  # m: range of starts for a prismatic joint without limits
 LOCKED = 1e-9  # rad or m: least range of a joint that the solver accepts
+PRECISE = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13)
 EXACT = 1e-9  # m, rad: a solution within this distance of the target ends the search
 
 
@@ -86,8 +87,7 @@ def nearest(
     margin = 1e-12 * (1 + np.where(np.isfinite(width), width, 0))  # the solver must start inside the limits
     for start in [q, *starts[np.argsort(far)[:IMPROVED]]]:
         inside = np.clip(start, low + margin, high - margin)
-        precise = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13)
-        found.append(least_squares(residual, inside, slope, (low, high), max_nfev=MOST_STEPS, **precise))
+        found.append(least_squares(residual, inside, slope, (low, high), max_nfev=MOST_STEPS, **PRECISE))
         if found[-1].cost < 0.5 * EXACT**2:
             break
     best = min(found, key=lambda each: each.cost)

@@ -58,13 +58,21 @@ def by_removal(
         causes_of: function that returns the causes of a repeated run.
     """
     trials = _Trials(judge, missed, repeat)
-    tried = trials.tried(why)
+    tried, others = trials.tried(why), list[Cause]()
     if _most(tried) < HALF:
-        tried += [cause for cause in trials.tried(_others(judge, missed, why)) if (cause.removes or 0.0) >= LITTLE]
+        others = trials.tried(_others(judge, missed, why))
+        tried += [cause for cause in others if (cause.removes or 0.0) >= LITTLE]
     most = _most(tried)
     if most >= LITTLE or any(map(_is_open, tried)):
-        counted = [_counted(cause, most) for cause in tried if cause.removes is None or abs(cause.removes) >= SMALL]
+        counted = [
+            cause._replace(noted=_is_noted(cause, tried, most))
+            for cause in tried
+            if cause.removes is None or abs(cause.removes) >= SMALL
+        ]
         tried = sorted(counted, key=lambda cause: _rank(cause, max(0.0, 1.0 - most)))
+    elif both := next((some for some in (tried, tried + others) if trials.without_all(some) >= LITTLE), None):
+        tried = [cause._replace(noted=cause.noted and not cause.tried) for cause in both]  # only together they keep it
+        tried.sort(key=lambda cause: _rank(cause, 0.0))
     root = trials.without(tried[0]) if tried else None
     if root is None:
         return tuple(tried)
@@ -103,14 +111,25 @@ class _Trials:
         plan = self._plans.get(cause.text)
         return None if plan is None else self._results.get(plan)
 
+    def without_all(self, tried: Sequence[Cause]) -> float:
+        """Return the part of the error that the run without all causes has not."""
+        result = self._without([self._plans[cause.text] for cause in tried if cause.tried])
+        return 0.0 if result is None else 1.0 - self._size(result) / self._size(self._judge)
+
+    def _without(self, plans: Sequence[Repetition]) -> Judge | None:
+        """Return the judge of a run with the settings of several plans; None for one plan, or if it failed."""
+        if len({*plans}) < 2:
+            return None
+        settings = dict(pair for plan in reversed(plans) for pair in plan.settings)
+        whole = Repetition("", tuple(settings.items()), max(plan.longer for plan in plans))
+        if whole not in self._results and (result := self._repeat([whole])[0]) is not None:
+            self._results[whole] = result
+        return self._results.get(whole)
+
     def together(self, tried: list[Cause]) -> list[Cause]:
         """Return the causes, the last of several with the errors of the run without all of them."""
         each = [*dict.fromkeys(self._plans[cause.text] for cause in tried if cause.tried and not cause.noted)]
-        if len(each) < 2:
-            return tried
-        settings = dict(pair for plan in reversed(each) for pair in plan.settings)
-        (result,) = self._repeat([Repetition("", tuple(settings.items()), max(plan.longer for plan in each))])
-        if result is None:
+        if (result := self._without(each)) is None:
             return tried
         words = f"; without {'both' if len(each) == 2 else 'all'}: {_errors(result, self._missed)}"
         last = [cause.tried != "" and self._plans[cause.text] == each[-1] for cause in tried]
@@ -130,11 +149,14 @@ def _most(tried: Sequence[Cause]) -> float:
     return max((cause.removes for cause in tried if cause.removes is not None), default=0.0)
 
 
-def _counted(cause: Cause, most: float) -> Cause:
-    """Return a cause that is noted if it reduces the error, or follows from one that explains all of the error."""
-    reduces = cause.removes is not None and cause.removes < 0.0
-    follows = cause.kind in FOLLOWING and most > WHOLE and cause.removes != most
-    return cause._replace(noted=reduces or follows or (cause.noted and cause.removes is None))
+def _is_noted(cause: Cause, tried: Sequence[Cause], most: float) -> bool:
+    """Return whether a cause reduces the error, or follows from another one."""
+    if cause.removes is not None and cause.removes < 0.0:
+        return True
+    kinds = {other.kind for other in tried}
+    led = cause.kind in FOLLOWING or (cause.kind == "reach" and "degrees" in kinds)
+    beyond = cause.kind == "limit" and any(c.kind == "reach" and c.joint == cause.joint for c in tried)
+    return beyond or (led and most > WHOLE and cause.removes != most) or (cause.noted and cause.removes is None)
 
 
 def _is_open(cause: Cause) -> bool:
@@ -219,11 +241,11 @@ def _without(judge: Judge, cause: Cause) -> Repetition | None:
         case "damping":
             return plan("with critical damping", _critical(judge))
         case "degrees":
-            return plan("read as degrees", _in_radians(judge))
-        case "reach" if not judge.wanted("quat").size and not judge.moving:
+            return plan("read as degrees", _in_radians(judge, cause.joint))
+        case "reach" if not judge.wanted("quat").size and judge.changed <= 0.0:
             return plan("with a target in reach", _in_reach(judge, cause))
         case "time" if not judge.moving and cause.share <= LONGER * judge.duration:
-            return Repetition(f"at {judge.duration + cause.share:.4g} s", longer=cause.share)
+            return Repetition(f"after {judge.duration + cause.share:.4g} s", longer=cause.share)
     return None
 
 
@@ -245,14 +267,11 @@ def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
     return "without it", _elements(held, subject, 0.0)
 
 
-def _in_radians(judge: Judge) -> dict[str, float]:
-    """Return large positions of revolute joints, read as degrees, in rad."""
-    return {
-        f"{group}[{i + 1}]": radians(value)
-        for group in ("q_des", "q_start")
-        for i, (value, unit) in enumerate(zip(judge.given(group), judge.setup.units))
-        if unit == "rad" and abs(value) > TURN
-    }
+def _in_radians(judge: Judge, joint: str) -> dict[str, float]:
+    """Return large positions of a joint, read as degrees, in rad."""
+    i = judge.setup.joints.index(joint)
+    values = {f"{group}[{i + 1}]": judge.held.get(f"{group}[{i + 1}]", 0.0) for group in ("q_des", "q_start")}
+    return {name: radians(value) for name, value in values.items() if abs(value) > TURN}
 
 
 def _raised(judge: Judge) -> dict[str, float]:
@@ -280,5 +299,5 @@ def _in_reach(judge: Judge, cause: Cause) -> dict[str, float]:
     setup = judge.setup
     if cause.point:
         return {f"x_des[{i + 1}]": cause.point[row] for i, row in enumerate(setup.rows)}
-    inside = np.clip(judge.wanted("q"), setup.low, setup.high)
-    return {f"q_des[{i + 1}]": float(value) for i, value in enumerate(inside)}
+    i = setup.joints.index(cause.joint)
+    return {f"q_des[{i + 1}]": float(np.clip(judge.wanted("q")[i], setup.low[i], setup.high[i]))}

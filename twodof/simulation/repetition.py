@@ -1,6 +1,7 @@
 """Runs that are repeated with other settings, in memory."""
 
 import logging
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,7 @@ from .setup import robot_of
 from .stepping import Stop, judge_of, stepped
 
 MOST_STEPS = 5000  # communication steps of a run that is repeated
-PATIENCE = 10.0  # s of wall time for all repetitions at one time, which only steps that are slow beyond measure need
+PATIENCE = 5.0  # s of wall time; if repetitions need more, all are left out
 
 
 def is_repeatable(run: Experiment) -> bool:
@@ -34,22 +35,27 @@ def _is_native(fmu: Fmu) -> bool:
 
 
 def repeated(run: Experiment, plans: Sequence[Repetition]) -> list[Judge | None]:
-    """Run an experiment again for each plan; return the judges, None for a run that failed or took too long."""
+    """Run an experiment again for each plan; return the judges, None for a run that failed.
+
+    All are None if they take longer than PATIENCE: causes with results and others are not comparable.
+    """
     end = time.monotonic() + PATIENCE
     try:
         with instantiate(run.fmu) as instance, _without_messages():
-            return [_judged(_changed(run, plan), instance, lambda: time.monotonic() > end) for plan in plans]
+            judges = [_judged(_changed(run, plan), instance, lambda: time.monotonic() > end) for plan in plans]
     except FmuError:  # the file was replaced meanwhile
         return [None] * len(plans)
+    return judges if time.monotonic() <= end else [None] * len(plans)
 
 
 def _changed(run: Experiment, plan: Repetition) -> Experiment:
-    settings = dict(plan.settings)
+    settings, end = dict(plan.settings), run.time(run.steps)
+    due = [(t, {n: v for n, v in inputs.items() if n not in settings}) for t, inputs in run.changes if t <= end]
     return replace(
         run,
         given={**run.given, **settings},
         start_values={**run.start_values, **settings},
-        changes=[(t, {n: v for n, v in inputs.items() if n not in settings}) for t, inputs in run.changes],
+        changes=due,
         steps=run.steps + ceil(plan.longer / run.step),
         signals=(),
     )
@@ -69,10 +75,11 @@ def _judged(run: Experiment, instance: Instance | SystemInstance, stop: Stop) ->
 
 @contextmanager
 def _without_messages() -> Iterator[None]:
-    """Discard log messages of FMUs."""
+    """Discard log messages of FMUs in this thread."""
+    own = threading.get_ident()
 
-    def reject(_record: logging.LogRecord) -> bool:
-        return False
+    def reject(record: logging.LogRecord) -> bool:
+        return record.thread != own
 
     logger.addFilter(reject)
     try:
