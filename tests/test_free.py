@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from harness import unzipped
 import twodof
 from twodof.errors import BuildError
 from twodof.files import data_file
+from twodof.fmu import instantiate, load_fmu
+from twodof.fmu.instance import Instance
 from twodof.plant.variables import FREE
 
 VALUES: dict[str, Any] = {
@@ -52,6 +56,21 @@ def inverse_dynamics(values: dict[str, Any], v: np.ndarray, a: np.ndarray) -> np
     return np.array(pin.rnea(model, model.createData(), Q, v, a)) + of_joints
 
 
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """1 kg on a horizontal slide, whose friction is an input."""
+    folder = tmp_path_factory.mktemp("slide")
+    inertia = 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
+    joint = '<parent link="base"/><child link="l"/><axis xyz="1 0 0"/>'
+    limit = '<limit lower="-1000" upper="1000" effort="1000" velocity="100"/>'
+    (folder / "slide.urdf").write_text(
+        f'<robot name="slide"><link name="base"/><link name="l"><inertial><mass value="1"/><inertia {inertia}/>'
+        f'</inertial></link><joint name="j" type="prismatic">{joint}{limit}</joint></robot>'
+    )
+    options = twodof.FmuOptions(folder / "slide.urdf", native=True, control="effort", free=("friction",))
+    return twodof.build_fmu(folder / "slide.fmu", options)
+
+
 class FMU2Arm(FMU2Model):
     """The bare arm in initialization mode, as Model Exchange."""
 
@@ -73,6 +92,108 @@ class FMU2Arm(FMU2Model):
     def put(self, **values: Any) -> None:
         for group, value in values.items():
             self.setReal(self.elements(group), list(value))
+
+
+@pytest.mark.parametrize("given", [[0.0, 0.0], [0.02, 0.0]], ids=["none", "one"])
+@pytest.mark.parametrize("v", [[1.1, -2.3], [0.0, -2.3], [0.0, 0.0]], ids=["both", "second", "neither"])
+def test_a_friction_of_0_has_the_derivatives_of_the_smallest_friction(
+    fmus: dict[str, Path], given: list[float], v: list[float]
+) -> None:
+    """M ∂q̈ = −s with the direction s in which a joint moves or begins to move: friction is never negative."""
+    smooth = {**VALUES, "friction": np.zeros(2)}
+    arm = FMU2Arm.__new__(FMU2Arm).open(
+        fmus["free"], **{**smooth, "friction": given}, q_start=Q, v_start=v, tau_cmd=TAU
+    )
+    arm.exitInitializationMode()
+    rates = [arm.vr["der(v[1])"], arm.vr["der(v[2])"]]
+    a = np.array(arm.getReal(rates))
+    s = np.sign(np.where(v, v, a))
+    np.testing.assert_allclose(inverse_dynamics(smooth, np.array(v), a) + s * given, TAU, atol=1e-12)
+    zero = inverse_dynamics(smooth, np.array(v), np.zeros(2))
+    M = np.column_stack([inverse_dynamics(smooth, np.array(v), unit) - zero for unit in np.eye(2)])
+    for _ in range(2):  # the first derivative at a point is computed alone, others together
+        for i, vr in enumerate(arm.elements("friction")):
+            found = arm.getDirectionalDerivative(rates, [vr], [1.0])
+            np.testing.assert_allclose(found, -np.linalg.inv(M)[:, i] * s[i], rtol=1e-10)
+
+
+def test_a_clamped_joint_that_has_no_friction_has_the_derivatives_of_the_smallest_friction(
+    fmus: dict[str, Path],
+) -> None:
+    """The second joint acts on the first one as if it fell against its friction: both columns are those of M⁻¹."""
+    pressed = {"payload": 0.3, "q_max[2]": 0.3, "q_start[2]": 0.3, "rigid_stops": False, "v_start[1]": 1.0}
+    rates, knowns = ["der(v[1])", "der(v[2])"], ["friction[1]", "friction[2]"]
+
+    def answer(size: float) -> tuple[np.ndarray, np.ndarray]:
+        with instantiate(load_fmu(fmus["free"])) as arm:
+            assert isinstance(arm, Instance)
+            arm.initialise(0.0, math.inf, {**pressed, **dict.fromkeys(knowns, size)})
+            return np.array(arm.reader(rates)()), np.asarray(arm.derivatives(rates, knowns))
+
+    (a, slopes), (after, close) = answer(0.0), answer(1e-6)
+    np.testing.assert_allclose(slopes, close, rtol=1e-9)
+    np.testing.assert_allclose(slopes.sum(axis=1), (after - a) / 1e-6, rtol=1e-6)
+    assert slopes[0].all() and not slopes[1].any()
+
+
+def slid(fmu: Path, table: list[tuple[float, float]], v: float, tau: float, stop_time: float) -> np.ndarray:
+    """Return the velocities of a slide after each millisecond, by Model Exchange and Heun's method.
+
+    Friction is interpolated in the table, which FMPy's CVode does only after steps. A step in which an indicator
+    changes its sign ends with an event.
+    """
+    slide, times, values = FMU2Arm.__new__(FMU2Arm), *zip(*table)
+    slide.open(fmu, v_start=[v], tau_cmd=[tau], friction=values[:1]).exitInitializationMode()
+    y, rate, z = (ctypes.c_double * 2)(0.0, v), (ctypes.c_double * 2)(), (ctypes.c_double * 3)()
+
+    def event() -> list[bool]:
+        while slide.newDiscreteStates()[0]:
+            pass
+        slide.enterContinuousTimeMode()
+        return signs()
+
+    def signs() -> list[bool]:
+        slide.getEventIndicators(z, 3)
+        return [x > 0.0 for x in z]
+
+    def rates(t: float, state: np.ndarray) -> np.ndarray:
+        slide.setTime(t)
+        slide.put(friction=[np.interp(t, times, values)])
+        y[:] = state.tolist()
+        slide.setContinuousStates(y, 2)
+        slide.getDerivatives(rate, 2)
+        return np.array(rate)
+
+    before, found, h = event(), [v], 1e-3
+    for k in range(round(stop_time / h)):
+        first = rates(k * h, np.array(y))
+        second = rates((k + 1) * h, (begun := np.array(y)) + h * first)
+        rates((k + 1) * h, begun + 0.5 * h * (first + second))
+        if slide.completedIntegratorStep()[0] or signs() != before:
+            slide.enterEventMode()
+            before = event()
+            slide.getContinuousStates(y, 2)
+        found.append(y[1])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("v", [2.0, -2.0])
+def test_a_friction_that_rises_from_0_within_a_run_stops_a_slide(slide: Path, v: float) -> None:
+    """A ramp from 0 to 1 N takes 0.05 m/s of 1 kg in 0.1 s; then 1 N decelerates the slide until it rests."""
+    found = slid(slide, [(0.5, 0.0), (0.6, 1.0)], v, 0.0, 3.0)
+    t = np.arange(0.0, 3.0005, 1e-3)
+    lost = np.where(t < 0.6, 5.0 * np.maximum(t - 0.5, 0.0) ** 2, t - 0.55)
+    np.testing.assert_allclose(found, np.sign(v) * np.maximum(2.0 - lost, 0.0), atol=1.1e-3)
+    assert found[-1] == 0.0
+
+
+def test_a_friction_that_returns_after_a_reversal_acts_against_the_motion(slide: Path) -> None:
+    """−1 N drives 1 kg from 0.5 m/s. Friction takes 0.03 N·s until 0.2 s, vanishes, and returns with 0.5 N at 1 s.
+
+    The velocity reverses at 0.47 s, without friction.
+    """
+    found = slid(slide, [(0.1, 0.2), (0.2, 0.0), (1.0, 0.0), (1.1, 0.5)], 0.5, -1.0, 2.0)
+    np.testing.assert_allclose(found[[200, 1000, 1100, 2000]], [0.27, -0.53, -0.605, -1.055], atol=1e-3)
 
 
 @pytest.mark.parametrize("rests", [False, True])

@@ -52,6 +52,28 @@ static int wanted(Instance *instance, const Request *request)
     return wants;
 }
 
+/* Return the regime in which derivatives are computed. A friction of 0 that is an input begins to act against the motion
+   as it rises, so that its derivatives are one-sided. For the other joints, a clamped joint moves on. */
+static Stops regime_of(const State *state)
+{
+    const double *value = state->plant.value;
+    double a[N_JOINTS], effort[N_JOINTS];
+    Stops stops = state->stops, reacting = state->stops;
+    if (!CHANGES_FRICTION)
+        return stops;
+    for (int i = 0; i < N_JOINTS; i++)
+        reacting.held[i] = reacts(&stops, i) ? stops.held[i] : FREE;
+    acceleration(&state->plant, &value[Q], &value[V], slip_of(&stops), stops.rank, a, NULL);
+    restrain(&state->plant, &reacting, &value[Q], a, effort);
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double rate = value[V + i] != 0.0 && !stops.held[i] ? value[V + i] : a[i];
+        if (value[FRICTION + i] == 0.0 && !reacts(&stops, i))
+            stops.slip[i] = (rate > 0.0) - (rate < 0.0);
+        stops.any_slip |= stops.slip[i] != 0;
+    }
+    return stops;
+}
+
 /* Return nonzero if the request's derivatives of the rates are products with the Jacobian, and compute the Jacobian if
    necessary: for several directions, and for joints with reactions, which `differentiate` does not consider. Without
    reactions the Jacobian does not contain the columns of the control law's inputs. */
@@ -65,7 +87,8 @@ static int has_slopes(Instance *instance, int several, const Request *request)
     several |= state->has_rates & DIRECTION;
     if (!(state->has_rates & SLOPES) && (several || reactions || instance->asks_several)) {
         update_rates(state);
-        acceleration_slopes(&state->plant, &state->stops, instance->slope);
+        const Stops stops = regime_of(state);
+        acceleration_slopes(&state->plant, &stops, instance->slope);
         state->has_rates |= SLOPES;
     }
     state->has_rates |= DIRECTION;
@@ -163,14 +186,15 @@ static Status directional_derivative(void *component, const Reference unknown[],
         return OK;
     if (!prepare(instance, &request, result, n_result, seed, n_seed))
         return ERROR;
-    const Stops *stops = &instance->state.stops;
     double change[X] = {0}, derivative[FIRST_PARAMETER] = {0};
     for (size_t i = 0; i < n_given; i++)
         for (int k = begin_of(given[i]); k < end_of(given[i]); k++)
             change[k] += *seed++;
-    if (request.wants)
-        differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, request.wants, change,
+    if (request.wants) {
+        const Stops stops = regime_of(&instance->state);
+        differentiate(instance->state.plant.value, stops.held, stops.slip, stops.rank, request.wants, change,
                       derivative);
+    }
     for (int k = 0; k < X && request.by_product; k++)
         if (change[k] != 0.0)
             add_column(instance, k, change[k], &derivative[DER_Q]);
@@ -194,7 +218,7 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
     Instance *instance = enter(component, request.call, 1);
     if (!instance || !prepare(instance, &request, seed, n_seed, result, n_result))
         return ERROR;
-    const Stops *stops = &instance->state.stops;
+    const Stops stops = regime_of(&instance->state);
     double weight[FIRST_PARAMETER] = {0}, sum[FIRST_PARAMETER] = {0};
     for (size_t i = 0; i < n_unknown; i++)
         for (int k = begin_of(unknown[i]); k < end_of(unknown[i]); k++)
@@ -204,7 +228,7 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
             double change[X] = {0}, derivative[FIRST_PARAMETER] = {0};
             change[k] = 1.0;
             if (request.wants)
-                differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, request.wants,
+                differentiate(instance->state.plant.value, stops.held, stops.slip, stops.rank, request.wants,
                               change, derivative);
             if (request.by_product)
                 add_column(instance, k, 1.0, &derivative[DER_Q]);

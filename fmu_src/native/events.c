@@ -1,13 +1,16 @@
 /* State events of joint stops, of friction and of J⁺. The indicator of a limit is the distance of the joint from a
    position just past the limit, or, for a joint at rest there, the effort that presses it against the limit. The
    indicator of friction is the velocity in the direction of slip, or, for a joint that sticks, the distance of the
-   holding effort from its bounds. Offsets keep each indicator away from zero after its event. */
+   holding effort from its bounds. That of a joint without friction is the friction itself, where it is an input and may
+   rise. Offsets keep each indicator away from zero after its event. */
 #include <float.h>
 #include <math.h>
 #include <string.h>
 
 /* Distance of an event past a limit, relative to max(1, |limit|): some hundred units in the last place. */
 static const double PAST = 1e-13;
+/* True if the importer may change friction between events. */
+enum { CHANGES_FRICTION = FRICTION >= Q - N_FREE && FRICTION < Q };
 /* s: factor of the velocity away from a limit in the indicator of the limit, and of the acceleration in the indicator
    of slip. */
 static const double CLEARING = 1.0;
@@ -51,6 +54,8 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
         double *at[2] = {&indicator[i], &indicator[N_JOINTS + i]}, *friction = &indicator[2 * N_JOINTS + i];
         const int slip = stops->held[i] ? 0 : stops->slip[i], side = is_above(plant, q[i], i) ? 1 : -1;
         *friction = slip ? slip * v[i] + BACK + CLEARING * fmax(0.0, slip * a[i]) : 1.0;
+        if (CHANGES_FRICTION && !stops->slip[i] && !reacts(stops, i))
+            *friction = PULL - plant->value[FRICTION + i];
         *at[0] = room(high[i], high[i] - q[i], -v[i]);
         *at[1] = room(low[i], q[i] - low[i], v[i]);
         if (stops->held[i]) /* a joint without a range stays at rest */
