@@ -1,7 +1,9 @@
 """J⁺b of the controller against numpy's pinv."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from native_models import from_urdf
 
 from twodof.plant.pseudo_inverse import apply_pseudo_inverse
 
@@ -48,9 +50,34 @@ def test_a_given_rank_keeps_the_largest_singular_values(m, n):
         assert (margin >= 0.0) == (rank == (ratios > RCOND).sum())
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_zero_jacobian_gives_zero(m):
-    assert apply_pseudo_inverse([[0.0, 0.0]] * m, [1.0] * m, RCOND)[:2] == ([0.0, 0.0], 0)
+@pytest.mark.parametrize("m", [1, 2, 3, 6])
+@pytest.mark.parametrize("error", [0.0, 1e-16])
+def test_a_jacobian_that_is_zero_but_for_rounding_errors_gives_zero(m, error):
+    jacobian = error * np.random.default_rng(m).normal(size=(m, 7))
+    assert apply_pseudo_inverse(jacobian.tolist(), [1.0] * m, RCOND)[:2] == ([0.0] * 7, 0)
+
+
+def test_a_task_across_the_plane_of_an_arm_commands_no_motion():
+    """A wall, written as 1.5707963267948966 rad, leaves a Jacobian of 1e-17 m: the effort is Pinocchio's weight."""
+    body = (
+        '<inertial><origin xyz="0.1 0 0"/><mass value="1"/>'
+        '<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    joint = '<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="50" velocity="9"/>'
+    urdf = (
+        f'<robot name="wall"><link name="base"/><link name="a">{body}</link><link name="b">{body}</link>'
+        f'<link name="tip"/><joint name="j1" type="revolute"><parent link="base"/><child link="a"/>{joint}'
+        '<origin xyz="0 0 0.3" rpy="1.5707963267948966 0 0"/></joint>'
+        f'<joint name="j2" type="revolute"><parent link="a"/><child link="b"/>{joint}<origin xyz="0.2 0 0"/></joint>'
+        '<joint name="e" type="fixed"><parent link="b"/><child link="tip"/><origin xyz="0.2 0 0"/></joint></robot>'
+    )
+    plant = from_urdf(urdf, "tip", "y").plant()
+    plant.q, plant.x_des = [0.1, 0.2], [0.05]
+    reference = pin.buildModelFromXML(urdf)
+    weight = pin.computeGeneralizedGravity(reference, reference.createData(), np.array(plant.q))
+    np.testing.assert_allclose(plant.tau, weight, rtol=1e-12)
+    plant.step(0.1)
+    assert plant.q == [0.1, 0.2]
 
 
 def test_rcond_zero_keeps_every_singular_value():

@@ -166,9 +166,12 @@ def test_pseudo_inverse_equals_numpy(name, singular):
         assert deviation(result, expected) <= 1e-11
 
 
-def test_pseudo_inverse_of_zero_is_zero():
-    native, result = engine("ur5"), np.full(6, np.nan)
-    native.call("pseudo_inverse", np.zeros((3, 6)), np.ones(3), 0.01, result)
+@pytest.mark.parametrize("name", ["finger", "twodof", "ur5"])
+@pytest.mark.parametrize("error", [0.0, 1e-16])
+def test_pseudo_inverse_of_rounding_errors_is_zero(name, error):
+    native = engine(name)
+    J, result = error * np.random.default_rng(1).normal(size=(native.m, native.n)), np.full(native.n, np.nan)
+    native.call("pseudo_inverse", J, np.ones(native.m), 0.01, result)
     assert not result.any()
 
 

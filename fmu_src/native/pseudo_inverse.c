@@ -8,6 +8,9 @@ static const double WELL_CONDITIONED = 1e-3;
 /* Two rows count as orthogonal if the cosine of their angle, or the ratio of their lengths, is below 2⁻⁵⁰. If the ratio
    is, the shorter row is the rounding error of a linearly dependent row. */
 static const double ORTHOGONAL = 1.0 / 1125899906842624.0;
+/* m or 1: 2⁻⁴³, larger than the rounding errors in a Jacobian of a robot of 100 m. If no singular value is larger, the
+   task cannot move. */
+static const double VANISHING = 1.0 / 8796093022208.0;
 enum { MAX_SWEEPS = 12 };
 
 static double dot(const double a[N_JOINTS], const double b[N_JOINTS])
@@ -28,7 +31,7 @@ static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_R
     const double determinant = g00 * g11 - g01 * g01;
     const double trace = g00 + g11;
     const double scale = trace * trace; /* ≥ σ_max⁴ */
-    if (!(RE(determinant) > RE(smallest * scale)))
+    if (!(RE(determinant) > RE(smallest * scale)) || !(RE(trace) > RE(VANISHING * VANISHING)))
         return 0;
     y[0] = (g11 * b[0] - g01 * b[1]) / determinant;
     y[1] = (g00 * b[1] - g01 * b[0]) / determinant;
@@ -44,7 +47,7 @@ static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_R
     const double determinant = g00 * c00 + g01 * c01 + g02 * c02;
     const double trace = g00 + g11 + g22;
     const double scale = 0.25 * trace * trace * trace; /* ≥ σ_max⁴ σ₂²/σ_max², as λ₁λ₂ ≤ (λ₁ + λ₂)²/4 */
-    if (!(RE(determinant) > RE(smallest * scale)))
+    if (!(RE(determinant) > RE(smallest * scale)) || !(RE(trace) > RE(VANISHING * VANISHING)))
         return 0;
     y[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant;
     y[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant;
@@ -118,7 +121,8 @@ static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double squa
 }
 #endif
 
-/* σ/σ_max of orthogonal rows in descending order; index has the rank order of the rows. */
+/* σ/σ_max of orthogonal rows in descending order, all 0 where σ_max is rounding error; index has the rank order of the
+   rows. */
 static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double ratio[N_ROWS],
                       int index[N_ROWS])
 {
@@ -131,7 +135,7 @@ static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double 
             index[RE(square[j]) < RE(square[k]) ? j : k]++;
     }
     for (int k = 0; k < N_ROWS; k++)
-        ratio[index[k]] = RE(largest) > 0.0 ? sqrt(square[k] / largest) : 0.0;
+        ratio[index[k]] = RE(largest) > RE(VANISHING * VANISHING) ? sqrt(square[k] / largest) : 0.0;
 }
 
 /* Distance of the singular values next to a rank from rcond, as ratios to the largest; negative if the rule σ >
@@ -193,7 +197,7 @@ INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], 
     return rank;
 }
 
-/* σ/σ_max of J in descending order; all are 0 for a zero matrix. J is working memory. */
+/* σ/σ_max of J in descending order; all are 0 where σ_max is rounding error. J is working memory. */
 INTERNAL void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
 {
     double nothing[N_ROWS] = {0}, square[N_ROWS];

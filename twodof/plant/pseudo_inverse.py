@@ -15,6 +15,10 @@ ORTHOGONAL = 2.0**-50
 """Two rows count as orthogonal if the cosine of their angle, or the ratio of their lengths, is below this. If the ratio
 is, the shorter row is the rounding error of a linearly dependent row.
 """
+VANISHING = 2.0**-43
+"""Larger than the rounding errors, m or 1, in a Jacobian of a robot of 100 m. If no singular value is larger, the task
+cannot move.
+"""
 MAX_SWEEPS = 12
 PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 
@@ -28,7 +32,8 @@ def apply_pseudo_inverse(
         rows: J, m rows of n.
         b: m values.
         rcond: in [0, 1).
-        rank: rank of J⁺; None keeps σ > rcond·σ_max, the rule of ``numpy.linalg.pinv``.
+        rank: rank of J⁺; None keeps σ > rcond·σ_max, the rule of ``numpy.linalg.pinv``, and none where σ_max is
+            rounding error.
 
     Returns:
         The least-squares solution of smallest norm, n values; the rank; and the rank's margin, which is
@@ -45,7 +50,7 @@ def apply_pseudo_inverse(
         determinant = g00 * g11 - g01 * g01
         trace = g00 + g11
         scale = trace * trace  # ≥ σ_max⁴
-        if determinant > smallest * scale:
+        if determinant > smallest * scale and trace > VANISHING**2:
             y0 = (g11 * b[0] - g01 * b[1]) / determinant
             y1 = (g00 * b[1] - g01 * b[0]) / determinant
             result = [y0 * x0 + y1 * x1 for x0, x1 in zip(r0, r1)]
@@ -60,7 +65,7 @@ def apply_pseudo_inverse(
         determinant = g00 * c00 + g01 * c01 + g02 * c02
         trace = g00 + g11 + g22
         scale = 0.25 * trace * trace * trace  # ≥ σ_1⁴ σ_2², as λ₁λ₂ ≤ (λ₁ + λ₂)²/4
-        if determinant > smallest * scale:
+        if determinant > smallest * scale and trace > VANISHING**2:
             c11, c12, c22 = g00 * g22 - g02 * g02, g01 * g02 - g00 * g12, g00 * g11 - g01 * g01
             y0 = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant
             y1 = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant
@@ -98,14 +103,14 @@ def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
 
 
 def singular_ratios(rows: Sequence[Sequence[float]]) -> list[float]:
-    """Return σ/σ_max of a matrix in descending order; all are 0 for a zero matrix."""
+    """Return σ/σ_max of a matrix in descending order; all are 0 where σ_max is rounding error."""
     orthogonal, _ = _orthogonal([list(row) for row in rows], [0.0] * len(rows))
     return _ratios([_dot(row, row) for row in orthogonal])
 
 
 def _ratios(squares: Sequence[float]) -> list[float]:
     largest = max(squares)
-    return [sqrt(square / largest) if largest else 0.0 for square in sorted(squares, reverse=True)]
+    return [sqrt(square / largest) if largest > VANISHING**2 else 0.0 for square in sorted(squares, reverse=True)]
 
 
 def _orthogonal(rows: list[list[float]], b: list[float]) -> tuple[list[list[float]], list[float]]:
