@@ -93,10 +93,10 @@ def follow(model: Any, target: Any, seconds: float, home: Sequence[float]) -> An
     return np.array(samples).transpose(1, 0, 2)
 
 
-def noisy(motion: Any, seed: int = 0) -> tuple[Array, Array]:
-    """Positions and efforts with the noise of encoders, 1e-4 rad, and of torque sensors, 2 %."""
+def noisy(motion: Any, seed: int = 0, part: float = 0.02) -> tuple[Array, Array]:
+    """Positions and efforts with the noise of encoders, 1e-4 rad, and of torque sensors, a part of the effort."""
     rng, (q, _, effort) = np.random.default_rng(seed), motion
-    return q + 1e-4 * rng.normal(size=q.shape), effort * (1.0 + 0.02 * rng.normal(size=q.shape))
+    return q + 1e-4 * rng.normal(size=q.shape), effort * (1.0 + part * rng.normal(size=q.shape))
 
 
 def bag_of(path: Path, joints: Sequence[str], q: Array, effort: Array | None, stamps: Array | None = None) -> Path:

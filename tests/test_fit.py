@@ -109,6 +109,20 @@ def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):
     assert any("does not explain" in line and "'joint2'" in line for line in result.remarks)
 
 
+def test_a_small_error_of_the_model_is_not_noise(motion, tmp_path):
+    """The base is tilted by 0.01 rad: the effort differs by less than 1 %, and the payload by many deviations."""
+    q, effort = noisy(motion, part=0.005)
+    tilted = (9.81 * np.sin(0.01), -9.81 * np.cos(0.01), 0.0)
+    result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort), FREE, gravity=tilted)
+    assert max(misfit.part for misfit in result.misfits) < 0.01
+    (payload,) = (p for p in result.parameters if p.name == "payload")
+    assert abs(payload.after - TRUTH["payload"]) > 5.0 * payload.deviation
+    assert not result.explains and "residuals are noise" not in str(result)
+    assert "explains these data only roughly, and the intervals are too narrow" in result.remarks[0]
+    level = twodof.fit(ARM, tmp_path / "bag", (*FREE, "gravity"), gravity=tilted)
+    assert level.explains and "residuals are noise" in level.remarks[0]
+
+
 def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
     q: Any
     effort: Any
@@ -121,6 +135,10 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         q, effort, stamps = q[:100], effort[:100], stamps[:100]
     elif change == "still":
         q[:, 1] = 0.3 + 1e-4 * np.random.default_rng(0).normal(size=len(q))
+    elif change == "spikes":
+        q[np.random.default_rng(0).choice(len(q), 6), 1] += 0.3
+    elif change == "degrees":
+        q = np.degrees(q)
     elif change == "nan":
         q[700, 1] = np.nan
     elif change == "huge":
@@ -144,6 +162,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("another robot", "has no joint 'joint1'"),
         ("short", "is too short"),
         ("still", "joint 'joint2' never moves"),
+        ("spikes", "the position of joint 'joint2' in"),
+        ("degrees", "rad: they are probably in degrees"),
         ("nan", "the position of joint 'joint2' at 7 s is not a number"),
         ("huge", "the position of joint 'joint2' at 7 s is beyond 1e+100"),
         ("millinewton", "a factor of 1000"),

@@ -28,8 +28,8 @@ PRIOR_SHARE = 0.1
 """Share of the prior in the variance of a value, above which the data do not determine the value."""
 SHARP = 0.05
 """Standard deviation relative to a value, below which the data determine it whatever the prior's share."""
-UNEXPLAINED, SIGNIFICANCE = 0.01, 1e-4
-"""Slow residuals are reported if they exceed this fraction of the efforts, and have less than this probability."""
+SIGNIFICANCE = 1e-4
+"""Probability of slow residuals below which they are not noise."""
 
 
 class Misfit(NamedTuple):
@@ -51,8 +51,8 @@ class Misfit(NamedTuple):
 
     @property
     def bad(self) -> bool:
-        """True if the model does not explain the data."""
-        return self.probability < SIGNIFICANCE and self.part > UNEXPLAINED
+        """True if the slow residuals are not noise, or exceed the efforts."""
+        return self.probability < SIGNIFICANCE or self.part > 1.0
 
 
 class Estimate(NamedTuple):

@@ -24,6 +24,8 @@ from .prediction import WINDOW
 
 MOST_NAMES = 6
 """Largest number of parameters that the page names in its verdict."""
+UNEXPLAINED = 0.01
+"""Slow residuals that are not noise, as a fraction of the efforts, above which the model does not explain the data."""
 MOST_COMBINATIONS = 5
 """Largest number of combinations that the summary lists."""
 
@@ -126,13 +128,7 @@ class Fit:
     def _warnings(self) -> list[str]:
         lines = []
         if bad := [misfit for misfit in self.misfits if misfit.bad]:
-            worst = max(bad, key=lambda misfit: misfit.part)
-            lines.append(
-                f"the model does not explain these data, least at joint '{self.joints[worst.joint]}': slow residuals"
-                f" of {worst.rms:.3g} {self._effort_unit(worst.joint)}, {100 * worst.part:.2g} % of its effort, have"
-                f" {worst.ratio:.3g} times the variance of fast ones; free more parameters, or look for what the URDF"
-                " does not have"
-            )
+            lines.append(self._verdict(max(bad, key=lambda misfit: misfit.part)))
         if not self.converged:
             lines.append("the fit has not converged: free fewer parameters, or record more motion")
         for joint, t in self.jumps.items():
@@ -149,6 +145,18 @@ class Fit:
             side = "after" if self.delay[0] > 0.0 else "before"
             lines.append(f"efforts act {1e3 * abs(self.delay[0]):.3g} ms {side} their stamps")
         return lines
+
+    def _verdict(self, worst: Misfit) -> str:
+        """Return the line on a model whose residuals are not noise, worst at one joint."""
+        joint, unit = self.joints[worst.joint], self._effort_unit(worst.joint)
+        verdict = "explains these data only roughly, and the intervals are too narrow, most"
+        if worst.part > UNEXPLAINED:
+            verdict = "does not explain these data, least"
+        return (
+            f"the model {verdict} at joint '{joint}': slow residuals of {worst.rms:.3g} {unit},"
+            f" {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the variance of fast ones; free"
+            " more parameters, or look for what the URDF does not have"
+        )
 
     def _effort_unit(self, joint: int) -> str:
         return "N·m" if self.units[joint] == "rad" else "N"

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 WRONG_UNITS = 300.0
 """Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
+WRONG_RANGE = 3.0
+"""Ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected."""
 NORMAL_95 = 1.959964
 POSITIVE = ("friction", "damping", "armature", "payload", "mass")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -167,18 +169,28 @@ def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
 
 
 def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
-    """Refuse efforts that differ much from those of the URDF's masses.
+    """Refuse positions far beyond the URDF's range, and efforts that differ much from those of its masses.
 
     Raises:
-        InputError: the message has the ratio.
+        InputError: the message has the positions or the ratio.
     """
+    robot = parameters.robot
+    for i, joint in enumerate(robot.joints):
+        least = min(float(each.measured[:, i].min()) for each in fitted)
+        most = max(float(each.measured[:, i].max()) for each in fitted)
+        low, high = robot.q_min[i], robot.q_max[i]
+        if not robot.prismatic[i] and most - least > WRONG_RANGE * (high - low) > 0.0:
+            raise InputError(
+                f"the positions of joint '{joint}' are between {least:.3g} and {most:.3g}, and its limits {low:.3g} and"
+                f" {high:.3g} rad: they are probably in degrees; convert them, or correct the limits"
+            )
     values = parameters.dynamics(parameters.start)
     stretch = max(fitted, key=lambda each: len(each.t))
     few = stretch.part(slice(None, None, max(1, len(stretch.t) // 200)))
-    Y, G = regressors(parameters.robot, few, values.offset)
+    Y, G = regressors(robot, few, values.offset)
     model = Y @ values.inertial + np.einsum("g,kgij,j->ki", values.gravity, G, values.inertial)
     ours, theirs = np.sqrt(np.mean(model**2, axis=0)), np.sqrt(np.mean(few.tau**2, axis=0))
-    for joint, effort in zip(parameters.robot.joints, theirs):
+    for joint, effort in zip(robot.joints, theirs):
         if not effort:
             raise InputError(f"the effort of joint '{joint}' is 0 throughout: it was not recorded")
     ratio = float(np.median(theirs / np.maximum(ours, 1e-12)))

@@ -34,6 +34,7 @@ SHORTEST = 2.0  # s: shortest stretch between gaps
 EDGE = 0.15  # s at both ends of a stretch that are not used, because the filter has samples on one side only
 HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
+SPIKES = 0.01  # largest fraction of samples that are spikes
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
 MIXED = 0.03  # second difference of positions between close samples, as part of their range, that shows mixed samples
@@ -103,6 +104,7 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
             raise InputError(
                 f"the positions in '{name}' jump at {at:.4g} s: was the clock set back, or are there two bags?"
             )
+        _check_spikes(recording, robot, q)
         if 1.0 / h < LEAST_RATE:
             raise InputError(f"'{name}' has {1.0 / h:.3g} joint states a second; a fit needs {LEAST_RATE:g}")
         cuts = [0, *(np.flatnonzero(np.diff(t) > GAP * h) + 1), len(t)]
@@ -120,8 +122,33 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
         raise InputError("the recordings are too short to hold a fifth out")
     for i, joint in enumerate(robot.joints):
         if not any(stretch.moving[:, i].sum() * stretch.step >= 0.5 for stretch in fitted):
-            raise InputError(f"joint '{joint}' never moves in the recordings: lock it with `lock`, or record it moving")
+            raise InputError(
+                f"joint '{joint}' never moves beyond the noise of its positions: lock it with `lock`, or record it"
+                " moving"
+            )
     return _thinned(fitted, MOST_FITTED, "for the fit"), _thinned(held, MOST_HELD, "held out")
+
+
+def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
+    """Refuse positions of which a few samples are far from the samples before and after them.
+
+    Raises:
+        InputError: the message has the joint, the largest spike and the number of spikes.
+    """
+    low, high = np.percentile(q, (1.0, 99.0), axis=0)
+    steps = np.diff(q, axis=0)
+    usual = np.percentile(np.abs(steps), 100.0 * (1.0 - 2.0 * SPIKES), axis=0)
+    there_and_back = np.where(steps[1:] * steps[:-1] < 0.0, np.minimum(np.abs(steps[1:]), np.abs(steps[:-1])), 0.0)
+    spikes = there_and_back > np.maximum(MIXED * (high - low), 3.0 * usual)
+    for i, joint in enumerate(robot.joints):
+        count = int(spikes[:, i].sum())
+        if high[i] > low[i] and 0 < count <= SPIKES * len(q):
+            k = int(there_and_back[:, i].argmax())
+            raise InputError(
+                f"the position of joint '{joint}' in '{recording.path}' jumps by {there_and_back[k, i]:.3g} and back"
+                f" with the next sample, most at {recording.t[k + 1]:.4g} s, in {count} of {len(q)} samples: leave"
+                " these samples out"
+            )
 
 
 def _thinned(whole: Sequence[Stretch], most: int, purpose: str) -> list[Stretch]:
