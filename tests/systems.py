@@ -6,6 +6,7 @@ import io
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from twodof.export.compiler import compile_library, standard_headers
 
@@ -22,9 +23,13 @@ NAMESPACES = " ".join(
 
 
 def pd_fmu(
-    feedthrough: str = 'dependencies="{}"', unit: str = "rad", factor: float = 1.0, initial: str | None = None
+    feedthrough: str = 'dependencies="{}"',
+    unit: str = "rad",
+    factor: float = 1.0,
+    initial: str | None = None,
+    replaced: Mapping[str, str] = MappingProxyType({}),
 ) -> bytes:
-    """Return the FMU of native/pd.c, with q in a given unit of angle and stated dependencies."""
+    """Return the FMU of native/pd.c, with q in a given unit of angle, stated dependencies, and replaced texts."""
     rows = [
         *(
             (f"{name}[{i + 1}]", 2 * k + i, "input", f'Real start="0.0" unit="{unit if k != 1 else "rad/s"}"')
@@ -63,6 +68,9 @@ def pd_fmu(
 <ModelStructure><Outputs>{outputs}<Unknown index="12" dependencies=""/><Unknown index="13" dependencies="11"/>
 </Outputs>{"" if initial is None else f"<InitialUnknowns>{initially}</InitialUnknowns>"}</ModelStructure>
 </fmiModelDescription>"""
+    for old, new in replaced.items():
+        assert old in xml
+        xml = xml.replace(old, new)
     sources = {**standard_headers(), "pd.c": (HERE / "native/pd.c").read_bytes()}
     library = compile_library(sources, "linux64", "pd", units=["pd.c"], flags=["-fvisibility=default"])
     return zipped({"modelDescription.xml": xml.encode(), "binaries/linux64/pd.so": library})
@@ -95,6 +103,18 @@ def connectors(rows: Mapping[str, str], kind: str = "<ssc:Real{}/>") -> str:
         own = kind.format(f' unit="{unit}"' if unit else "")
         texts.append(f'<ssd:Connector name="{name}" kind="{causality}">{own}</ssd:Connector>')
     return f"<ssd:Connectors>{''.join(texts)}</ssd:Connectors>"
+
+
+def values(*rows: str, more: str = "") -> str:
+    """Return the XML of a parameter set, of rows "name kind value [unit]"."""
+    parameters = ""
+    for name, kind, value, *unit in map(str.split, rows):
+        units = f' unit="{unit[0]}"' if unit else ""
+        parameters += f'<ssv:Parameter name="{name}"><ssv:{kind} value="{value}"{units}/></ssv:Parameter>'
+    return (
+        f'<ssv:ParameterSet {NAMESPACES} version="1.0" name="set"><ssv:Parameters>{parameters}</ssv:Parameters>'
+        f"{more}</ssv:ParameterSet>"
+    )
 
 
 def component(name: str, more: str = "") -> str:

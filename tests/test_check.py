@@ -172,6 +172,15 @@ def test_another_start_value_than_the_stated_one_fails(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])
 @pytest.mark.parametrize("part", ["all", "controller"])
+@pytest.mark.parametrize("bounds", ['min="-1" max="0"', 'declaredType="Bounded"'])
+def test_inputs_stay_within_the_bounds_of_the_variable_or_its_type(bounds: str, tmp_path: Path) -> None:
+    """The FMU refuses values above 0."""
+    types = '<TypeDefinitions><SimpleType name="Bounded"><Real min="-1" max="0"/></SimpleType></TypeDefinitions>'
+    described = DESCRIPTION.replace("<DefaultExp", f"{types}<DefaultExp")
+    described = described.replace('causality="input"><Real', f'causality="input"><Real {bounds}')
+    assert not failed(twodof.check(foreign(tmp_path, "BOUNDED", described)))
+
+
 def test_a_sampled_controller_passes(part: Any, delay: float, tmp_path: Path) -> None:
     """Its effort depends on the target at a sampling instant, or a delay later, and not between two samples."""
     settings = {"control_period": 0.01, "control_delay": delay}

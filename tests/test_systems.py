@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from systems import NAMESPACES, WIRES, component, connection, connectors, loop, pd_fmu, ssd, zipped
+from systems import NAMESPACES, WIRES, component, connection, connectors, loop, pd_fmu, ssd, values, zipped
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import FmuError, InputError, SimulationError
-from twodof.fmu import ssp_file
+from twodof.fmu import load_any_fmu, ssp_file
 
 H, N = 0.01, 50
 TARGET = np.array([0.3, 0.2])
@@ -118,6 +118,63 @@ def test_units_are_converted_and_not_where_that_is_suppressed(plant: bytes, tmp_
     degrees = pd_fmu(unit="deg", factor=np.pi / 180.0)
     settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
     scaled = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: law(q, v, 180.0 / np.pi))
+@pytest.mark.parametrize("inherits", ['declaredType="Angle"', 'declaredType="Turn" unit="deg"'])
+def test_a_unit_may_come_from_a_declared_type_and_the_unit_of_a_variable_precedes_it(
+    inherits: str, plant: bytes, tmp_path: Path
+) -> None:
+    """FMI 2.0.4, section 2.2.7: attributes of the type are the defaults of the variable's."""
+    types = '<SimpleType name="Angle"><Real unit="deg"/></SimpleType><SimpleType name="Turn"><Real unit="N.m"/>'
+    replaced = {'unit="deg"/>': f"{inherits}/>", "<TypeDefinitions>": f"<TypeDefinitions>{types}</SimpleType>"}
+    own, declared = (pd_fmu(unit="deg", factor=np.pi / 180.0, replaced=r) for r in ({}, replaced))
+    settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
+    expected = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: law(q, v, 180.0 / np.pi))
+    for controller in (own, declared):
+        found = q_of(loop(tmp_path / "loop.ssp", plant, controller), **settings)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("by", ["variable", "type"])
+def test_a_difference_has_no_offset_of_its_unit(by: str, plant: bytes, tmp_path: Path) -> None:
+    """FMI 2.0.4, section 2.2.3: 10 degree Celsius = 10 Kelvin if relativeQuantity is true. As values and connected."""
+    relative = 'unit="far" relativeQuantity="true"/>'
+    typed = f'<TypeDefinitions><SimpleType name="Far"><Real {relative}</SimpleType>'
+    replaced = {'factor="1.0"': 'offset="1.0"'}
+    replaced |= (
+        {'unit="far"/>': relative}
+        if by == "variable"
+        else {'unit="far"/>': 'declaredType="Far"/>', "<TypeDefinitions>": typed}
+    )
+    controller = pd_fmu(unit="far", replaced=replaced)
+    units = "<ssc:Unit name='rad'><ssc:BaseUnit rad='1'/></ssc:Unit>"
+    units += "<ssc:Unit name='farther'><ssc:BaseUnit rad='1' offset='7'/></ssc:Unit>"
+    wires = WIRES.replace(connection("plant.q[1]", "pd.q[1]"), connection("plant.q[1]", "in.a"))
+    wires += connection("in.b", "pd.q[1]") + connection("goal", "pd.q_des[2]")
+    inner = connectors({"a": "input farther", "b": "output farther"})
+    inner = f'<ssd:System name="in">{inner}<ssd:Connections>{connection("a", "b")}</ssd:Connections></ssd:System>'
+    more = f"<ssv:Units>{units}</ssv:Units>"
+    given = binding(values("q_des[1] Real 0.3 farther", "Kp Real 0.1", "Kd Real 0.01", more=more))
+    goal = connectors({"goal": "input farther"}) + binding(values("goal Real 0.2 rad", more=more))
+    parts = BOTH.replace(component("pd"), component("pd", given)).replace("</ssd:Elements>", f"{inner}</ssd:Elements>")
+    structure = ssd(f"{goal}{parts}<ssd:Connections>{wires}</ssd:Connections>", f"<ssd:Units>{units}</ssd:Units>")
+    found = q_of(loop(tmp_path / "loop.ssp", plant, controller, structure))
+    np.testing.assert_allclose(found, by_hand(plant, tmp_path / "plant.fmu"), rtol=0, atol=1e-12)
+
+
+def test_arrays_of_fmi_3_have_the_attributes_of_their_declared_type(tmp_path: Path) -> None:
+    """FMI 3.0.2, section 2.4.4."""
+    variable = '<Float64 name="q" valueReference="1" causality="output" declaredType="A"{}><Dimension start="2"/>'
+    variable += '</Float64><Float64 name="time" valueReference="2" causality="independent" variability="continuous"/>'
+    units = '<UnitDefinitions><Unit name="deg"/><Unit name="rad"/></UnitDefinitions>'
+    declared = '<TypeDefinitions><Float64Type name="A" unit="deg" relativeQuantity="true" min="-1" max="2"/>'
+    declared = f"{units}{declared}</TypeDefinitions>"
+    for own, unit in (("", "deg"), (' unit="rad"', "rad")):
+        fmu = described(variable.format(own), '<Output valueReference="1"/>', "3.0", types=declared)
+        (tmp_path / "a.fmu").write_bytes(fmu)
+        found = load_any_fmu(tmp_path / "a.fmu")
+        assert [(v.unit, v.relative) for v in found.variables.values()][:2] == [(unit, True)] * 2
+        assert (found.description.modelVariables[0].min, found.description.modelVariables[0].max) == ("-1", "2")
+
+
     system = loop(tmp_path / "loop.ssp", plant, degrees)
     np.testing.assert_allclose(q_of(system, **settings), scaled, rtol=0, atol=1e-9)
     wires = "".join(
@@ -590,13 +647,17 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
 
 
 def described(
-    variables: str, structure: str = "", version: str = "2.0", files: Mapping[str, bytes] = MappingProxyType({})
+    variables: str,
+    structure: str = "",
+    version: str = "2.0",
+    files: Mapping[str, bytes] = MappingProxyType({}),
+    types: str = "",
 ) -> bytes:
     """Return an FMU of its description and other files."""
     identity = "guid" if version == "2.0" else "instantiationToken"
     xml = (
         f'<fmiModelDescription fmiVersion="{version}" modelName="m" {identity}="m">'
-        f'<CoSimulation modelIdentifier="m"/><ModelVariables>{variables}</ModelVariables>'
+        f'<CoSimulation modelIdentifier="m"/>{types}<ModelVariables>{variables}</ModelVariables>'
         f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
     )
     return zipped({"modelDescription.xml": xml.encode(), **files})

@@ -8,7 +8,7 @@
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
        READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
        KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
-       RESTORES_NO_INPUT };
+       RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE };
 #ifndef X
 #define X 1.0
 #endif
@@ -57,6 +57,8 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
     M *m = c;
     if (m->phase != 1) return fmi2Error;
+    for (size_t i = 0; i < n; i++)
+        if (FAULT == BOUNDED && r[i] == 1 && v[i] > 0.0) return fmi2Error;
     if (FAULT == DISCARDS && t > 0.05) return fmi2Discard;
     if (FAULT == DISCARDS_LARGE && h > 0.015) return fmi2Discard;
     m->x += h * (m->u - m->x);

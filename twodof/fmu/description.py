@@ -7,14 +7,13 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import chain, product
-from math import prod
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import fmpy
-from fmpy.model_description import ModelDescription, ModelVariable, ValidationError
+from fmpy.model_description import ModelDescription, ValidationError
 
 from ..bounds import MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, path_of
@@ -24,40 +23,12 @@ from ..export.start_values import groups_of, vector
 from ..files import read_member, shown
 from ..notebook import card, picture
 from .archives import checksums, open_archive, read_archive
-from .validation import NUMBERS, problems_of_names, problems_of_times, read_description
+from .scalar import Scalar, scalars
+from .validation import problems_of_names, problems_of_times, read_description
 
 RECORDED = ("q", "v", "x", "xd", "tau", "q_des", "x_des")
 """Vectors of a robot that bags, verdicts and plots contain in SI units."""
-
-
-@dataclass(frozen=True)
-class Scalar:
-    """A scalar variable, or an element of an array of FMI 3.0.
-
-    Attributes:
-        name: name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])".
-        causality, unit: as in the description.
-        type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description.
-        start: text of the start value; None without one.
-        description: description of the scalar, or of the whole array.
-        reference: value reference.
-        element: 0-based index in the array, row by row.
-    """
-
-    name: str
-    causality: str
-    type: str
-    unit: str | None
-    start: str | None
-    description: str
-    reference: int
-    element: int = 0
-
-    @property
-    def start_value(self) -> float | bool | None:
-        """Start value of a number or Boolean that has one."""
-        read = NUMBERS.get(self.type)
-        return None if self.start is None or read is None else read(self.start)
+SI = "a robot needs SI units, as rad, m and N.m"
 
 
 @dataclass(frozen=True, repr=False)
@@ -328,21 +299,3 @@ def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
         "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),
         **{key: robot.get(key, "") for key in ("frame", "root", "axes", "control")},
     }
-
-
-def scalars(variable: ModelVariable) -> Iterator[Scalar]:
-    """Yield a scalar variable itself, or the elements of an array."""
-    kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
-    rest, text = (variable.causality, kind, variable.unit), variable.description or ""
-    if not variable.dimensions:
-        yield Scalar(variable.name, *rest, variable.start, text, variable.valueReference)
-        return
-    starts: list[str | None] = [*(variable.start or "").split()] or [None]
-    if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
-        raise FmuError(f"{variable.name} has {len(starts)} start values; expected one, or one for each element")
-    inner = re.fullmatch(r"der\((.*)\)", variable.name)
-    for i, indices in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
-        index = f"[{','.join(map(str, indices))}]"
-        name = f"der({inner[1]}{index})" if inner else variable.name + index
-        start = starts[i % len(starts)]
-        yield Scalar(name, *rest, start, text, variable.valueReference, i)

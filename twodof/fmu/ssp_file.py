@@ -45,6 +45,16 @@ class Unit(NamedTuple):
     factor: float = 1.0
     offset: float = 0.0
 
+    @property
+    def is_scaled(self) -> bool:
+        """True if it is not a product of base units."""
+        return self.exponents is not None and (self.factor, self.offset) != (1.0, 0.0)
+
+    @property
+    def of_differences(self) -> Unit:
+        """The unit for differences of values, which has no offset."""
+        return self._replace(offset=0.0)
+
 
 class Affine(NamedTuple):
     """The map gain·x + offset of a value."""
@@ -123,7 +133,7 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
         with zipfile.ZipFile(path) as archive:
             file = _File(path, archive)
             root = file.xml(STRUCTURE, "Description")
-            units = _units(root.find(f"{SSD}Units"))
+            units = units_in(root.find(f"{SSD}Units"))
             top = root.find(f"{SSD}System")
             assert top is not None  # the schema requires it
             if sum(each.tag in (f"{SSD}Component", f"{SSD}System") for each in top.iterfind(".//*")) > MAX_COMPONENTS:
@@ -213,7 +223,7 @@ class _File:
 
     def _bound(self, binding: ET.Element, name: str) -> Iterator[Parameter]:
         root = self._content(binding, f"{SSD}ParameterValues", SSV, "ParameterValues", name)
-        units, prefix = _units(root.find(f"{SSV}Units")), binding.get("prefix", "")
+        units, prefix = units_in(root.find(f"{SSV}Units")), binding.get("prefix", "")
         given: dict[str, Parameter] = {}
         rows = root.findall(f"{SSV}Parameters/{SSV}Parameter")
         self._check_once([xml.get("name", "") for xml in rows], f"a parameter set of '{name or 'the system'}' sets")
@@ -258,7 +268,8 @@ def _schema(kind: str) -> lxml.etree.XMLSchema:
     return lxml.etree.XMLSchema(file=SCHEMAS / f"SystemStructure{kind}.xsd")
 
 
-def _units(xml: ET.Element | None) -> dict[str, Unit]:
+def units_in(xml: ET.Element | None) -> dict[str, Unit]:
+    """Return the units that an element of SSP defines, by name."""
     units = {}
     for unit in [] if xml is None else xml.iterfind(f"{SSC}Unit"):
         base, name = unit.find(f"{SSC}BaseUnit"), unit.get("name", "")

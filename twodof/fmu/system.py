@@ -17,7 +17,7 @@ from ..export.package import has_member
 from .description import Fmu, Scalar, load_any_fmu, logged
 from .ssp_file import IDENTITY, STRUCTURE, Affine, Parameter, read_ssp
 from .validation import NUMBERS
-from .wiring import Link, Node, Wiring, order
+from .wiring import Link, Node, Wiring, conversion, order
 
 
 @dataclass(frozen=True, repr=False)
@@ -195,7 +195,8 @@ def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> floa
     if isinstance(value, str):
         raise FmuError(f"'{path}': the value of '{node}', '{value:.80}', is text or an enumeration: not supported")
     if parameter.converts:
-        total = total.after(wiring.conversion(parameter.unit, wiring.unit(node), f"'{node}' and its value"))
+        given, own = wiring.applied(node, parameter.unit), wiring.unit(node)
+        total = total.after(conversion(path, given, own, f"'{node}' and its value"))
     return _typed(path, node, scalar, value if isinstance(value, bool) else total.of(value))
 
 

@@ -9,8 +9,9 @@ from math import inf, isfinite
 from fmpy.model_description import ModelVariable
 
 from ..errors import SimulationError
-from .description import Fmu, scalars
+from .description import Fmu
 from .instance import Instance
+from .scalar import scalars
 from .system_instance import instantiate_fmu
 
 STEPS = 20

@@ -22,6 +22,9 @@ NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Bo
 """Supported types of variables, and functions that parse their start values."""
 TIMES = {"startTime": 0.0, "stopTime": math.inf, "stepSize": 1.0}
 """Times of a default experiment, and values for those that it does not state."""
+RELATIVE = "relativeQuantity"
+OF_TYPES = (RELATIVE, "quantity", "unit", "displayUnit", "min", "max", "nominal")
+"""Attributes whose defaults are those of the declared type: FMI 2.0.4, section 2.2.7."""
 PART = r"""([A-Za-z_]\w*|'([\w!#$%&()*+,\-./:;<>=?@\[\]^{}|~ ]|\\['"?\\abfnrtv])+')(\[\d+(,\d+)*\])?"""
 CONVENTIONS = {
     "flat": re.compile(r"[^\r\n\t]*"),
@@ -41,7 +44,7 @@ def is_plain_xml(xml: bytes) -> bool:
 
 
 def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescription:
-    """Return FMPy's model description of a modelDescription.xml, with more of its checks.
+    """Return FMPy's model description of a modelDescription.xml, completed, with more of its checks.
 
     Raises:
         Exception: the description is not valid; a bare exception of one of several libraries.
@@ -52,7 +55,21 @@ def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescrip
     alone = io.BytesIO()  # FMPy would also read sources/buildDescription.xml of any size
     with zipfile.ZipFile(alone, "w") as archive:
         archive.writestr("modelDescription.xml", xml)
-    return fmpy.read_model_description(alone, validate=True, **more)
+    description = fmpy.read_model_description(alone, validate=True, **more)
+    _complete(description, root)
+    return description
+
+
+def _complete(description: ModelDescription, root: ET.Element) -> None:
+    """Insert the attributes of variables that FMPy leaves out: relativeQuantity, and those of declared types."""
+    variables = [(v.get("name"), each) for v in root.iterfind("ModelVariables/*") for each in (v, *v)]
+    stated = {name: each.get(RELATIVE) in TRUE for name, each in variables if RELATIVE in each.attrib}
+    for variable in description.modelVariables:
+        variable.relativeQuantity = stated.get(variable.name)
+        if (declared := variable.declaredType) is not None:
+            for name in OF_TYPES:
+                if getattr(variable, name) is None:
+                    setattr(variable, name, getattr(declared, name))
 
 
 def check_description(root: ET.Element, xml: bytes) -> None:

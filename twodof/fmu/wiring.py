@@ -10,7 +10,8 @@ from xml.etree import ElementTree as ET
 
 from ..bounds import MAX_COMPONENTS, MAX_WIRING
 from ..errors import FmuError, SspError, choice
-from .description import Fmu, Scalar
+from .description import Fmu
+from .scalar import Scalar
 from .ssp_file import EXPONENTS, IDENTITY, Affine, Connector, Element, Unit, transformation
 from .validation import NUMBERS, TRUE
 
@@ -43,7 +44,9 @@ class Wiring:
     def __init__(self, path: object, top: Element, fmus: Mapping[str, Fmu]) -> None:
         self._path, self._fmus = path, fmus
         self.elements = {element.name: element for element in top.walk()}
-        self._units = {name: _units_of(fmu) for name, fmu in fmus.items()}
+        self._units = {name: units_of(fmu) for name, fmu in fmus.items()}
+        variables = ((name, variable) for name, fmu in fmus.items() for variable in fmu.variables.values())
+        self._relative = {Node(name, variable.name) for name, variable in variables if variable.relative}
         for name, fmu in fmus.items():
             for own, connector in self.elements[name].connectors.items():
                 if own in fmu.variables:
@@ -76,11 +79,16 @@ class Wiring:
         return None
 
     def unit(self, node: Node) -> Unit:
-        """Return the unit of a variable, else that stated by its connector."""
+        """Return the unit of a variable, else that stated by its connector, as it applies there."""
         stated = self.elements[node.element].connectors.get(node.connector, Connector("")).unit
         scalar = self.scalar(node)
         own = self._own_unit(node, scalar) if scalar is not None else Unit()
-        return stated if not own.name or (own.exponents is None and own.name == stated.name) else own
+        known = stated if not own.name or (own.exponents is None and own.name == stated.name) else own
+        return self.applied(node, known)
+
+    def applied(self, node: Node, unit: Unit) -> Unit:
+        """Return a unit as it applies to a variable or connector: a difference has no offset."""
+        return unit.of_differences if node in self._relative else unit
 
     def _own_unit(self, node: Node, scalar: Scalar) -> Unit:
         return self._units[node.element].get(scalar.unit or "", Unit(scalar.unit or ""))
@@ -153,6 +161,8 @@ class Wiring:
                     break
             room = _spent(self._path, room, len(way))
             self._ways.append(way)
+            if self._relative & {way[0], way[-1]}:
+                self._relative |= {node for node in way if node.element not in self._fmus}
         return [Link(way[-1], way[0], self._map(way[::-1])) for way in self._ways]
 
     def passed(self, starts: Mapping[Node, float | bool]) -> dict[Node, float | bool]:
@@ -172,7 +182,7 @@ class Wiring:
             start, converts, affine = self._incoming[node]
             own = self.unit(node)
             if converts:
-                total = self.conversion(unit, own, f"'{start}' and '{node}'").after(total)
+                total = conversion(self._path, unit, own, f"'{start}' and '{node}'").after(total)
             total, unit = affine.after(total), own if own.name else unit
         source, target = self.scalar(way[0]), self.scalar(way[-1])
         assert target is not None
@@ -187,32 +197,31 @@ class Wiring:
             raise FmuError(f"'{self._path}': '{way[-1]}' is of type {target.type}, which is not transformed")
         return total
 
-    def conversion(self, source: Unit, target: Unit, what: str) -> Affine:
-        """Return the conversion between units; the identity if one of them is not stated.
 
-        Raises:
-            FmuError: the units differ in dimension, or are not defined.
-        """
-        if not source.name or not target.name or source == target:
+def conversion(path: object, source: Unit, target: Unit, what: str) -> Affine:
+    """Return the conversion between units; the identity if one of them is not stated.
+
+    Raises:
+        FmuError: the units differ in dimension, or are not defined.
+    """
+    if not source.name or not target.name or source == target:
+        return IDENTITY
+    if source.exponents is None or target.exponents is None:
+        if source.name == target.name:
             return IDENTITY
-        if source.exponents is None or target.exponents is None:
-            if source.name == target.name:
-                return IDENTITY
-            raise FmuError(
-                f"'{self._path}': {what} have the units '{source.name}' and '{target.name}', of which one"
-                " is not defined"
-            )
-        if source.exponents != target.exponents:
-            raise SspError(
-                f"'{self._path}': {what} have units of different dimensions, '{source.name}' and '{target.name}'"
-            )
-        if not (target.factor and source.factor and math.isfinite(source.factor / target.factor)):
-            names = f"'{source.name}' or '{target.name}'"
-            raise FmuError(f"'{self._path}': the unit {names} of {what} has no valid factor")
-        return Affine(source.factor / target.factor, (source.offset - target.offset) / target.factor)
+        raise FmuError(
+            f"'{path}': {what} have the units '{source.name}' and '{target.name}', of which one is not defined"
+        )
+    if source.exponents != target.exponents:
+        raise SspError(f"'{path}': {what} have units of different dimensions, '{source.name}' and '{target.name}'")
+    if not (target.factor and source.factor and math.isfinite(source.factor / target.factor)):
+        names = f"'{source.name}' or '{target.name}'"
+        raise FmuError(f"'{path}': the unit {names} of {what} has no valid factor")
+    return Affine(source.factor / target.factor, (source.offset - target.offset) / target.factor)
 
 
-def _units_of(fmu: Fmu) -> dict[str, Unit]:
+def units_of(fmu: Fmu) -> dict[str, Unit]:
+    """Return the units that an FMU defines, by name."""
     units = {}
     for unit in fmu.description.unitDefinitions:
         if (base := unit.baseUnit) is not None:

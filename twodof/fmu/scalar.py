@@ -1,0 +1,75 @@
+"""Scalar variables and elements of arrays of an FMU's description."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from math import prod
+
+from fmpy.model_description import ModelVariable
+
+from ..errors import FmuError
+from .validation import NUMBERS
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A scalar variable, or an element of an array of FMI 3.0.
+
+    Attributes:
+        name: name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])".
+        causality, unit: as in the description.
+        type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description.
+        start: text of the start value; None without one.
+        description: description of the scalar, or of the whole array.
+        reference: value reference.
+        variability: as in the description, or its default there.
+        relative: whether it is a difference of values, to which the offset of a unit does not apply.
+        element: 0-based index in the array, row by row.
+    """
+
+    name: str
+    causality: str
+    type: str
+    unit: str | None
+    start: str | None
+    description: str
+    reference: int
+    variability: str
+    relative: bool
+    element: int = 0
+
+    @property
+    def start_value(self) -> float | bool | None:
+        """Start value of a number or Boolean that has one."""
+        read = NUMBERS.get(self.type)
+        return None if self.start is None or read is None else read(self.start)
+
+
+def scalars(variable: ModelVariable) -> Iterator[Scalar]:
+    """Yield a scalar variable itself, or the elements of an array."""
+    kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
+    whole = Scalar(
+        name=variable.name,
+        causality=variable.causality,
+        type=kind,
+        unit=variable.unit,
+        start=variable.start,
+        description=variable.description or "",
+        reference=variable.valueReference,
+        variability=variable.variability,
+        relative=bool(variable.relativeQuantity),
+    )
+    if not variable.dimensions:
+        yield whole
+        return
+    starts: list[str | None] = [*(variable.start or "").split()] or [None]
+    if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
+        raise FmuError(f"{variable.name} has {len(starts)} start values; expected one, or one for each element")
+    inner = re.fullmatch(r"der\((.*)\)", variable.name)
+    for i, indices in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
+        index = f"[{','.join(map(str, indices))}]"
+        name = f"der({inner[1]}{index})" if inner else variable.name + index
+        yield replace(whole, name=name, start=starts[i % len(starts)], element=i)
