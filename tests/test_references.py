@@ -11,8 +11,9 @@ from pathlib import Path
 
 import fmpy
 import lxml.etree
+import numpy as np
 import pytest
-from systems import pd_fmu
+from systems import pd_fmu, values
 from tools import needs
 
 import twodof
@@ -278,3 +279,71 @@ def test_stimuli_and_results_may_be_truth_values_and_whole_numbers(tool: str, tm
     files["results.csv"] = "time,tau[1],steps\n" + results
     found = rows(with_references(pd_fmu(), files, tmp_path / "pd.fmu"), tool)
     assert [(row.outcome, row.text[:9]) for row in found.values()] == [("passed", "20 values")] * 4, found
+
+
+def of_controller(files: dict[str, str], path: Path, times: str = "", fmu: bytes | None = None) -> Path:
+    """Write the FMU of native/pd.c with one experiment e, of e.csv, results.csv and, if there, e.ssv."""
+    times = times or 'startTime="0" stopTime="0.2" stepSize="0.01"'
+    parameters = '<Parameters source="e.ssv"/>' if "e.ssv" in files else ""
+    stimuli = '<Stimuli source="e.csv"/>' if "e.csv" in files else ""
+    text = f'<Experiment name="e" {times} tolerance="1e-9">{parameters}{stimuli}<References source="results.csv"/>'
+    return with_references(fmu or pd_fmu(), {"e.exp": f"<E>{text}</Experiment></E>", **files}, path)
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_a_continuous_stimulus_is_interpolated_and_a_discrete_one_is_held(kind: str, tmp_path: Path) -> None:
+    """FMI 2.0.4, section 2.2.7: a discrete variable is constant between events. The effort is 10 q_des."""
+    first = 'name="q_des[1]" valueReference="4" causality="input" variability="{}"'
+    fmu = pd_fmu(replaced={first.format("continuous"): first.format(kind)})
+    of_step = [min(1.0, k / 10) if kind == "continuous" else float(k >= 10) for k in range(20)]
+    results = "".join(f"{0.01 * (k + 1)!r},{10.0 * value!r}\n" for k, value in enumerate(of_step))
+    files = {"e.csv": "time,q_des[1]\n0,0\n0.1,1\n0.2,1\n", "results.csv": f"time,tau[1]\n{results}"}
+    found = rows(of_controller(files, tmp_path / "pd.fmu", fmu=fmu), "fmpy")
+    assert [row.outcome for row in found.values()] == ["passed"] * 2, found
+
+
+@pytest.mark.parametrize("jump", [35, 36])
+def test_a_jump_of_a_stimulus_acts_at_its_communication_point(jump: int, tmp_path: Path) -> None:
+    """1 + 36 * 0.01 is rounded to less than 1.36."""
+    assert (1.0 + jump * 0.01 < float(f"1.{jump}")) == (jump == 36)
+    results = "".join(f"{1.0 + 0.01 * (k + 1)!r},{10.0 * (k >= jump)}\n" for k in range(50))
+    rise = f"1.{jump},0\n1.{jump},1"
+    files = {"e.csv": f"time,q_des[1]\n1,0\n{rise}\n1.5,1\n", "results.csv": f"time,tau[1]\n{results}"}
+    times = 'startTime="1" stopTime="1.5" stepSize="0.01"'
+    (row,) = rows(of_controller(files, tmp_path / "pd.fmu", times)).values()
+    assert row.outcome == "passed", row
+
+
+def test_a_parameter_set_is_converted_to_the_units_of_the_fmu(tmp_path: Path) -> None:
+    degree = '<ssc:Unit name="deg"><ssc:BaseUnit rad="1" factor="0.017453292519943295"/></ssc:Unit>'
+    files = {
+        "e.ssv": values("q_des[1] Real 90 deg", more=f"<ssv:Units>{degree}</ssv:Units>"),
+        "results.csv": f"time,tau[1]\n0.1,{5.0 * np.pi!r}\n",
+    }
+    found = rows(of_controller(files, tmp_path / "pd.fmu"), "fmpy")
+    assert [row.outcome for row in found.values()] == ["passed"] * 2, found
+
+
+@pytest.mark.parametrize(
+    "name, text, reason",
+    [
+        ("e.csv", "time,seen\n0,3.7\n", "e.csv: 'seen' has a value that is no whole number of 32 bits"),
+        ("e.csv", "time,seen\n0,4294967299\n", "e.csv: 'seen' has a value that is no whole number of 32 bits"),
+        ("e.ssv", values("seen Integer 4294967299"), "e.ssv: 'seen' has a value that is no whole number of 32 bits"),
+        ("e.csv", "time,mode\n0,1\n", "e.csv: 'mode' is of type Enumeration, which is not set"),
+        ("e.csv", "time,seen\n0,1\n0.2,1\n0.1,1\n", "e.csv: its times do not ascend"),
+    ],
+)
+def test_values_that_a_variable_cannot_have_are_refused(name: str, text: str, reason: str, tmp_path: Path) -> None:
+    files = {name: text, "results.csv": "time,tau[1]\n0.1,0\n"}
+    (row,) = rows(of_controller(files, tmp_path / "pd.fmu")).values()
+    assert row.outcome == "failed" and reason in row.text
+
+
+def test_the_steps_of_all_experiments_together_are_limited(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two experiments of 50 steps."""
+    monkeypatch.setattr("twodof.fmu.reference_runs.MOST_STEPS", 101)
+    assert len(references_of(load_any_fmu(built))) == 2
+    monkeypatch.setattr("twodof.fmu.reference_runs.MOST_STEPS", 100)
+    with pytest.raises(FmuError, match="'push' must be a run of at most 100 whole steps, together with those before"):
+        references_of(load_any_fmu(built))

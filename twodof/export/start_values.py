@@ -92,10 +92,15 @@ def _checked(fmu: Variables, name: str, value: object) -> Value:
     if not isfinite(number):
         raise InputError(f"{name} = {number} is not finite")
     if variable.type == "Integer":
-        if not (number.is_integer() and abs(number) < LIMIT_OF_INTEGERS):
+        if not is_whole(number):
             raise InputError(f"{name} = {value:.17g} must be a whole number of 32 bits")
         return int(number)
     return number
+
+
+def is_whole(number: float) -> bool:
+    """Return whether a number is a whole number of 32 bits."""
+    return float(number).is_integer() and abs(number) < LIMIT_OF_INTEGERS
 
 
 def _of_another(fmu: Variables, name: str) -> str:

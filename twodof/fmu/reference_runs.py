@@ -13,7 +13,6 @@ import posixpath
 import zipfile
 from array import array
 from collections.abc import Callable, Iterable, Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
@@ -23,9 +22,13 @@ from numpy.typing import NDArray
 
 from ..bounds import MAX_CELLS, MAX_REFERENCES
 from ..errors import FmuError, SimulationError
+from ..export.start_values import is_whole
 from ..files import read_member
 from .description import Fmu, opened
+from .scalar import Scalar
+from .ssp_file import SSV, Unit, units_in
 from .validation import NUMBERS, is_plain_xml
+from .wiring import conversion, units_of
 
 MANIFEST = "extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"
 TIME_TOLERANCE = 1e-6  # fraction of a communication step
@@ -46,7 +49,7 @@ class Reference(NamedTuple):
         tolerance: tolerance of the results; NaN if it states none.
         parameters: start values by name.
         stimuli, results: names of the columns without the time, and the numbers, with the time in the first column.
-        types: types of variables by name, "Real" without one.
+        variables: the FMU's variables by name.
     """
 
     name: str
@@ -57,7 +60,7 @@ class Reference(NamedTuple):
     parameters: Values
     stimuli: Table
     results: Table
-    types: Mapping[str, str] = MappingProxyType({})
+    variables: Mapping[str, Scalar]
 
     @property
     def steps(self) -> int:
@@ -69,15 +72,18 @@ class Reference(NamedTuple):
         return self.start + k * self.step
 
     def inputs(self, k: int) -> Values:
-        """Return the inputs that apply after k steps, each of its type; those that are not Real are held."""
+        """Return the inputs that apply after k steps, each of its type; those that are not continuous are held."""
         (names, numbers), t = self.stimuli, self.time(k)
-        times = numbers[:, 0]
-        last = max(0, np.searchsorted(times, t + TIME_TOLERANCE * self.step, side="right") - 1)
-        return {
-            n: KINDS[kind](np.interp(t, times, values) if kind == "Real" else values[last])
-            for n, values in zip(names, numbers[:, 1:].T)
-            for kind in [self.types.get(n, "Real")]
-        }
+        last = max(0, np.searchsorted(numbers[:, 0], t + TIME_TOLERANCE * self.step, side="right") - 1)
+        held, following = numbers[last], numbers[min(last + 1, len(numbers) - 1)]
+        span = following[0] - held[0]
+        part = max(0.0, t - held[0]) / span if span > 0.0 else 0.0
+        between = held + part * (following - held)
+        inputs: Values = {}
+        for name, last_value, value in zip(names, held[1:], between[1:]):
+            variable = self.variables[name]
+            inputs[name] = KINDS[variable.type](value if variable.variability == "continuous" else last_value)
+        return inputs
 
     def rows(
         self,
@@ -130,15 +136,14 @@ def references_of(fmu: Fmu) -> list[Reference]:
         return []
     with opened(fmu) as archive:
         try:
-            files = _Files(archive, posixpath.dirname(MANIFEST))
+            files = _Files(fmu, archive)
             related = [*files.xml(posixpath.basename(MANIFEST)).iter("Related")]
             files.digests = {r.get("source", ""): r.get("checksum", "") for r in related if _has_digest(r)}
             sources = [r.get("source", "") for r in related if r.get("role", "").startswith("experiment")]
             found = [files.reference(e) for source in sources for e in files.xml(source).iter("Experiment")]
         except (KeyError, ValueError, csv.Error, ET.ParseError) as error:
             raise FmuError(f"the references in '{fmu.path}' cannot be read: {error}") from error
-    types = {name: variable.type for name, variable in fmu.variables.items()}
-    kept = [reference._replace(types=types) for reference in found if reference is not None]
+    kept = [reference for reference in found if reference is not None]
     if len({reference.name for reference in kept}) < len(kept):
         raise FmuError(f"the references in '{fmu.path}' cannot be told apart: two experiments have one name")
     return kept
@@ -155,8 +160,9 @@ class _Files:
         digests: SHA3-256 of files by their URIs, as the manifest states them.
     """
 
-    def __init__(self, archive: zipfile.ZipFile, folder: str) -> None:
-        self._archive, self._folder, self._room, self._cells = archive, folder, MAX_REFERENCES, MAX_CELLS
+    def __init__(self, fmu: Fmu, archive: zipfile.ZipFile) -> None:
+        self._fmu, self._archive, self._folder = fmu, archive, posixpath.dirname(MANIFEST)
+        self._room, self._cells, self._steps = MAX_REFERENCES, MAX_CELLS, MOST_STEPS
         self.digests: dict[str, str] = {}
 
     def read(self, source: str) -> bytes:
@@ -183,27 +189,60 @@ class _Files:
             return None
         start, stop, step = (float(times.get(f"{key}", 0.0)) for key in ("startTime", "stopTime", "stepSize"))
         count = (stop - start) / step if step > 0.0 else 0.0
-        if not 0.5 < count < MOST_STEPS:
-            raise ValueError(f"experiment '{experiment.get('name')}' must be a run of at most {MOST_STEPS} whole steps")
+        if not 0.5 < count < self._steps:
+            most = f"at most {MOST_STEPS} whole steps, together with those before it"
+            raise ValueError(f"experiment '{experiment.get('name')}' must be a run of {most}")
+        self._steps -= round(count)
         return Reference(
             *(experiment.get("name", ""), start, stop, step, float(times.get("tolerance", "nan"))),
             parameters={} if parameters is None else self.parameters(parameters.get("source", "")),
-            stimuli=([], np.zeros((1, 1))) if stimuli is None else self.table(stimuli.get("source", "")),
+            stimuli=([], np.zeros((1, 1))) if stimuli is None else self.stimuli(stimuli.get("source", "")),
             results=self.table(results.get("source", "")),
+            variables=self._fmu.variables,
         )
 
     def parameters(self, source: str) -> Values:
-        """Return the numbers and Booleans of a parameter set."""
+        """Return the numbers and Booleans of a parameter set, in the units of the FMU."""
         read: dict[str, Callable[[str], float | bool]] = {**NUMBERS, "Float64": float, "Int32": int}
         values: Values = {}
-        for parameter in self.xml(source).iterfind(".//{*}Parameter"):
+        root = self.xml(source)
+        units = units_in(root.find(f"{SSV}Units"))
+        for parameter in root.iterfind(".//{*}Parameter"):
             for element in parameter:
                 name, kind = parameter.get("name", ""), element.tag.rpartition("}")[2]
                 if kind in read:
-                    values[name] = read[kind](element.get("value", "").strip())
+                    value, unit = read[kind](element.get("value", "").strip()), element.get("unit", "")
+                    values[name] = self._in_own_unit(source, name, value, units.get(unit, Unit(unit)))
+                    self._check(source, name, [values[name]])
                 elif kind != "Annotations":
                     raise ValueError(f"{source}: parameter '{name}' is of type {kind}, which is not set")
         return values
+
+    def _in_own_unit(self, source: str, name: str, value: float | bool, unit: Unit) -> float | bool:
+        """Return a value of a parameter set in the unit of its variable."""
+        if (variable := self._fmu.variables.get(name)) is None:
+            return value
+        own = units_of(self._fmu).get(variable.unit or "", Unit(variable.unit or ""))
+        if variable.relative:
+            own, unit = own.of_differences, unit.of_differences
+        return conversion(f"{self._fmu.path}/{source}", unit, own, f"'{name}' and its value").of(value)
+
+    def stimuli(self, source: str) -> Table:
+        """Return the columns of inputs over time."""
+        names, numbers = self.table(source)
+        if (np.diff(numbers[:, 0]) < 0.0).any():
+            raise ValueError(f"{source}: its times do not ascend")
+        for name, values in zip(names, numbers.T[1:]):
+            self._check(source, name, values)
+        return names, numbers
+
+    def _check(self, source: str, name: str, values: Iterable[float]) -> None:
+        """Raise for values that a variable cannot have."""
+        kind = self._fmu.variables[name].type if name in self._fmu.variables else "Real"
+        if kind not in KINDS:
+            raise ValueError(f"{source}: '{name}' is of type {kind}, which is not set")
+        if kind == "Integer" and not all(map(is_whole, values)):
+            raise ValueError(f"{source}: '{name}' has a value that is no whole number of 32 bits")
 
     def table(self, source: str) -> Table:
         """Return the columns of a CSV file."""
