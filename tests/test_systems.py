@@ -71,18 +71,6 @@ def q_of(path: Path, **settings: object) -> np.ndarray:
     return np.array([sample.q for sample in twodof.samples(path, step=H, stop_time=N * H, settings=given)])
 
 
-def values(*rows: str, more: str = "") -> str:
-    """Return the XML of a parameter set, of rows "name kind value [unit]"."""
-    parameters = ""
-    for name, kind, value, *unit in map(str.split, rows):
-        units = f' unit="{unit[0]}"' if unit else ""
-        parameters += f'<ssv:Parameter name="{name}"><ssv:{kind} value="{value}"{units}/></ssv:Parameter>'
-    return (
-        f'<ssv:ParameterSet {NAMESPACES} version="1.0" name="set"><ssv:Parameters>{parameters}</ssv:Parameters>'
-        f"{more}</ssv:ParameterSet>"
-    )
-
-
 def binding(content: str = "", mapping: str = "", attributes: str = "") -> str:
     """Return the XML of an inline binding, or of one with attributes such as a source."""
     inline = f"<ssd:ParameterValues>{content}</ssd:ParameterValues>" if content else ""
@@ -118,6 +106,18 @@ def test_units_are_converted_and_not_where_that_is_suppressed(plant: bytes, tmp_
     degrees = pd_fmu(unit="deg", factor=np.pi / 180.0)
     settings = dict(pd__Kp=0.1, pd__Kd=0.01, pd__q_des=np.rad2deg(TARGET))
     scaled = by_hand(plant, tmp_path / "plant.fmu", lambda q, v: law(q, v, 180.0 / np.pi))
+    system = loop(tmp_path / "loop.ssp", plant, degrees)
+    np.testing.assert_allclose(q_of(system, **settings), scaled, rtol=0, atol=1e-9)
+    wires = "".join(
+        connection(f"{a}[{i}]", f"{b}[{i}]", more='suppressUnitConversion="true"')
+        for i in (1, 2)
+        for a, b in (("plant.q", "pd.q"), ("plant.v", "pd.v"), ("pd.tau", "plant.tau_cmd"))
+    )
+    system = loop(tmp_path / "loop.ssp", plant, degrees, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
+    plain = by_hand(plant, tmp_path / "plant.fmu")
+    np.testing.assert_array_equal(q_of(system, **{**settings, "pd__q_des": TARGET}), plain)
+
+
 @pytest.mark.parametrize("inherits", ['declaredType="Angle"', 'declaredType="Turn" unit="deg"'])
 def test_a_unit_may_come_from_a_declared_type_and_the_unit_of_a_variable_precedes_it(
     inherits: str, plant: bytes, tmp_path: Path
@@ -173,18 +173,6 @@ def test_arrays_of_fmi_3_have_the_attributes_of_their_declared_type(tmp_path: Pa
         found = load_any_fmu(tmp_path / "a.fmu")
         assert [(v.unit, v.relative) for v in found.variables.values()][:2] == [(unit, True)] * 2
         assert (found.description.modelVariables[0].min, found.description.modelVariables[0].max) == ("-1", "2")
-
-
-    system = loop(tmp_path / "loop.ssp", plant, degrees)
-    np.testing.assert_allclose(q_of(system, **settings), scaled, rtol=0, atol=1e-9)
-    wires = "".join(
-        connection(f"{a}[{i}]", f"{b}[{i}]", more='suppressUnitConversion="true"')
-        for i in (1, 2)
-        for a, b in (("plant.q", "pd.q"), ("plant.v", "pd.v"), ("pd.tau", "plant.tau_cmd"))
-    )
-    system = loop(tmp_path / "loop.ssp", plant, degrees, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
-    plain = by_hand(plant, tmp_path / "plant.fmu")
-    np.testing.assert_array_equal(q_of(system, **{**settings, "pd__q_des": TARGET}), plain)
 
 
 def test_a_connector_may_repeat_the_unit_of_its_variable(plant: bytes, tmp_path: Path) -> None:
@@ -259,11 +247,47 @@ def test_a_robot_in_other_units_than_those_of_a_bag_is_refused(plant: bytes, pd:
     with zipfile.ZipFile(io.BytesIO(plant)) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     text, scaled = files["modelDescription.xml"], rb'\1 factor="0.0174533"'
-    files["modelDescription.xml"] = re.sub(rb'(<Unit name="rad/s">\s*<BaseUnit[^>]*) factor="1"', scaled, text)
-    (tmp_path / "plant.fmu").write_bytes(degrees := zipped(files))
-    for path in (tmp_path / "plant.fmu", loop(tmp_path / "loop.ssp", degrees, pd)):
-        with pytest.raises(FmuError, match=r"v\[1\] is in rad/s; a robot needs SI units"):
-            twodof.load_fmu(path)
+    text = re.sub(rb'(<Unit name="rad/s">\s*<BaseUnit[^>]*) factor="1"', scaled, text)
+    typed = re.sub(rb' unit="rad/s"(?=[^>]* declaredType=)', b"", text)
+    assert typed.count(b'unit="rad/s"') == 1  # of the type
+    for files["modelDescription.xml"] in (text, typed):
+        (tmp_path / "plant.fmu").write_bytes(degrees := zipped(files))
+        for path in (tmp_path / "plant.fmu", loop(tmp_path / "loop.ssp", degrees, pd)):
+            with pytest.raises(FmuError, match=r"v\[1\] is in rad/s; a robot needs SI units"):
+                twodof.load_fmu(path)
+
+
+def test_a_connector_gives_a_unit_to_a_robot_without_one(tmp_path: Path) -> None:
+    outputs = "".join(
+        f'<ScalarVariable name="{name}[1]" valueReference="{k}" causality="output"><Real/></ScalarVariable>'
+        for k, name in enumerate("qv", 1)
+    )
+    robot = described(outputs, '<Outputs><Unknown index="1"/><Unknown index="2"/></Outputs>')
+    part = component("plant", connectors({"q[1]": "output deg"}))
+    structure = ssd(f"<ssd:Elements>{part}</ssd:Elements>", f"<ssd:Units>{DEGREE}</ssd:Units>")
+    with pytest.raises(FmuError, match=r"plant\.q\[1\] is in deg; a robot needs SI units"):
+        twodof.load_fmu(loop(tmp_path / "loop.ssp", robot, robot, structure))
+
+
+def test_only_a_target_in_si_units_that_drives_the_robot_is_its_target(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """A verdict, a bag and a plot compare q_des with q, in rad."""
+    wired, apart = (ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>") for wires in (WIRES, ""))
+    degrees = pd_fmu(unit="deg", factor=np.pi / 180.0)
+    truths = {}
+    for i in (1, 2):
+        number = f'valueReference="{3 + i}" causality="input" variability="continuous"><Real start="0.0" unit="rad"/>'
+        truth = f'valueReference="{51 + i}" causality="input" variability="discrete"><Boolean start="true"/>'
+        truths[f'name="q_des[{i}]" {number}'] = f'name="q_des[{i}]" {truth}'
+    for controller, structure, is_target in (
+        (pd, wired, True),
+        (degrees, wired, False),
+        (pd, apart, False),
+        (pd_fmu(replaced=truths), wired, False),
+    ):
+        path = loop(tmp_path / "loop.ssp", plant, controller, structure)
+        system = twodof.load_fmu(path)
+        assert [bool(system.vector(name)) for name in ("q_des", "pd.q_des")] == [is_target, True]
+        assert (twodof.run(path, step=H, stop_time=N * H).error is not None) == is_target
 
 
 def test_a_run_has_the_times_of_the_default_experiment(plant: bytes, pd: bytes, tmp_path: Path) -> None:
@@ -610,6 +634,12 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     ):
         parts = wired.replace(component("pd"), component("pd", inner))
         yield f"{name} twice", ssd(parts), {}, r"of 'pd' sets 'Kp' twice"
+    for name, value in (("set", "Integer 4294967299"), ("real set", "Real 4294967299")):
+        parts = wired.replace(component("pd"), component("pd", binding(values(f"seen {value}"))))
+        yield name, ssd(parts), {}, "no whole number of 32 bits"
+    both = connection("k", "pd.q_des[1]") + connection("k", "pd.seen")
+    own = connectors({"k": "input"}) + more.format(both)
+    yield "two types", ssd(own), {}, "the connector 'k' goes to variables of type Integer and Real"
     yield "no FMU", None, {"resources/pd.fmu": b"PK no zip"}, "resources/pd.fmu' is not an FMU"
     slip = zipped({"modelDescription.xml": b"<a/>", "../out": b""})
     yield "FMU slips", None, {"resources/pd.fmu": slip}, "is outside of its folder"

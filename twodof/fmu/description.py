@@ -228,7 +228,7 @@ def logged(fmu: Fmu) -> Fmu:
     scaled = {name for name, base in bases.items() if (base.factor or 1.0, base.offset or 0.0) != (1.0, 0.0)}
     for name in chain(*map(fmu.vector, RECORDED)):
         if (unit := fmu.variables[name].unit) in scaled:
-            raise FmuError(f"'{fmu.path}': {name} is in {unit}; a robot needs SI units, as rad, m and N.m")
+            raise FmuError(f"'{fmu.path}': {name} is in {unit}; {SI}")
     if len(fmu.joints) != n:
         raise FmuError(f"'{fmu.path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from ..bounds import MAX_DESCRIPTIONS, MAX_FILES, MAX_VARIABLES
-from ..errors import FmuError, choice
+from ..errors import FmuError, SspError, choice
 from ..export.package import has_member
-from .description import Fmu, Scalar, load_any_fmu, logged
+from ..export.start_values import is_whole
+from .description import RECORDED, SI, Fmu, load_any_fmu, logged
+from .scalar import Scalar
 from .ssp_file import IDENTITY, STRUCTURE, Affine, Parameter, read_ssp
 from .validation import NUMBERS
 from .wiring import Link, Node, Wiring, conversion, order
@@ -174,6 +176,15 @@ def _measuring(fmus: Mapping[str, Fmu], links: list[Link], robot: str) -> str:
     return having[0] if len(having) == 1 else robot
 
 
+def _driving(links: list[Link], robot: str) -> set[str]:
+    """Return the robot, and the components on whose outputs its inputs depend."""
+    driving = found = {robot}
+    while found:
+        found = {link.source.element for link in links if link.target.element in found} - driving
+        driving = driving | found
+    return driving
+
+
 def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
     """Return start values from parameter bindings; outer systems take precedence over inner ones.
 
@@ -205,8 +216,8 @@ def _typed(path: Path, node: Node, scalar: Scalar | None, value: float | bool) -
     kind, truth = "Real" if scalar is None else scalar.type, isinstance(value, bool)
     if scalar is not None and (truth != (kind == "Boolean") or kind not in NUMBERS):
         raise FmuError(f"'{path}': the value of '{node}', {value}, is not of type {kind}")
-    if not math.isfinite(value) or (kind == "Integer" and value != int(value)):
-        raise FmuError(f"'{path}': the value of '{node}', {value}, is not finite, or no whole number")
+    if not math.isfinite(value) or (kind == "Integer" and not is_whole(value)):
+        raise FmuError(f"'{path}': the value of '{node}', {value}, is not finite, or no whole number of 32 bits")
     return int(value) if kind == "Integer" else value
 
 
@@ -221,7 +232,8 @@ def _variables(
 ) -> tuple[dict[str, Scalar], dict[str, Node]]:
     """Return the variables of a system, and the component's variable or the connector for each of them.
 
-    Names without a component are those of the robot, except for measured values.
+    Names without a component are those of the robot, except for measured values. A target is known by its own name,
+    which makes it the target of the robot, only if it drives the robot and is in SI units.
     """
     variables: dict[str, Scalar] = {}
     places: dict[str, Node] = {}
@@ -241,6 +253,8 @@ def _variables(
             continue
         scalars = [scalar for link in targets if (scalar := wiring.scalar(link.target)) is not None]
         first = scalars[0]
+        if len(types := sorted({scalar.type for scalar in scalars})) > 1:
+            raise SspError(f"'{path}': the connector '{source}' goes to variables of type {' and '.join(types)}")
         causality = "input" if any(scalar.causality == "input" for scalar in scalars) else "parameter"
         values = [starts.get(link.target, scalar.start_value) for link, scalar in zip(targets, scalars)]
         inverted = {value if value is None else link.map.inverse(value) for link, value in zip(targets, values)}
@@ -249,12 +263,19 @@ def _variables(
         add(str(source), source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
     ends = {link.target for link in links}
     names = Counter(name for fmu in fmus.values() for name in fmu.variables)
+    driving = _driving(links, robot)
     for element in (robot, *(name for name in fmus if name != robot)):
         for scalar in fmus[element].variables.values():
             node = Node(element, scalar.name)
             if scalar.causality in ("input", "output", "parameter"):
                 alone = scalar.causality == "input" and node not in ends and names[scalar.name] == 1
-                of = measuring if scalar.name.partition("[")[0] in ("q_meas", "v_meas") else robot
+                group = scalar.name.partition("[")[0]
+                of = measuring if group in ("q_meas", "v_meas") else robot
+                if group in RECORDED:
+                    unit = wiring.unit(node)
+                    if unit.is_scaled and element == robot:
+                        raise FmuError(f"'{path}': {node} is in {unit.name}; {SI}")
+                    alone &= element in driving and scalar.type == "Real" and not unit.is_scaled
                 own = (element == of or alone) and scalar.name not in variables
                 start = starts.get(node, scalar.start_value)
                 causality = "local" if node in ends else scalar.causality
