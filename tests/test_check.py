@@ -293,7 +293,7 @@ def test_an_fmu_for_another_machine_is_not_run(tmp_path: Path) -> None:
         other.writestr("modelDescription.xml", archive.read("modelDescription.xml"))
         other.writestr("binaries/win64/Foreign.dll", b"")
     check = twodof.check(tmp_path / "other.fmu")
-    assert {row.outcome for row in check.rows[1:]} == {"does not apply"}
+    assert {row.outcome for row in check.rows[1:]} == {"does not apply"} and len(check.rows) == 12
     assert "only for: win64" in check.rows[1].text
 
 
@@ -321,6 +321,9 @@ def test_the_command_prints_a_table_or_json(
         ("pd.q[1]", "pd.v[1]", "is not from an output to an input"),
         ("pd.on", "pd.enabled", "has an algebraic loop"),
     ],
+    asked = twodof.check(tmp_path / "other.fmu", tools=["fmpy"])
+    assert failed(asked)["references"].startswith("not run with fmpy: it has no binary for this machine")
+    assert main(["check", str(tmp_path / "other.fmu"), "--with", "fmpy"]) == 1
 )
 def test_only_connections_that_ssp_forbids_fail(start: str, end: str, text: str, tmp_path: Path) -> None:
     wire = connection(start, end)

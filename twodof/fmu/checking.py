@@ -122,6 +122,8 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
     if known.platform not in known.platforms:
         reason = f"it has no binary for this machine ({known.platform}), only for: {', '.join(known.platforms)}"
         yield from (Row(name, "does not apply", reason) for name in TRIALS)
+        unmet = ("failed", f"not run with {' or '.join(tools)}: {reason}") if tools else ("does not apply", reason)
+        yield Row("references", *unmet)
         return
     runs = _runs(known, tools)
     yield from _tried(known, [*(_Task(name) for name in TRIALS), *runs])
