@@ -124,6 +124,48 @@ def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path, native_path):
     assert plot.read_text().count("<polyline") == 1
 
 
+ARM = """
+from helper import ACCELERATION
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+class Arm(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.q = self.v = 0.0
+        for name, own in (("q[1]", "q"), ("v[1]", "v")):
+            getter = lambda own=own: getattr(self, own)
+            self.register_variable(Real(name, causality=Fmi2Causality.output, getter=getter))
+
+    def do_step(self, time, step):
+        self.v += ACCELERATION * step
+        self.q += self.v * step
+        return True
+"""
+VERSIONS = """
+import pytest
+from twodof.testing import assert_equal
+
+def test_versions(run_fmu):
+    old, new, again = (run_fmu(f"{k}/Arm.fmu", stop_time=1.0, step=0.01) for k in (1, 5, 1))
+    assert [run.v[-1, 0] for run in (old, new, again)] == pytest.approx([1.0, 5.0, 1.0])
+    with pytest.raises(AssertionError):
+        assert_equal(new, old, within=1e-9)
+"""
+
+
+def test_two_versions_of_a_python_fmu_run_their_own_code(tmp_path):
+    """Their modules have equal names; they have no efforts to record."""
+    for k in (1, 5):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        (folder / "arm.py").write_text(ARM)
+        (folder / "helper.py").write_text(f"ACCELERATION = {k}.0\n")
+        python("-m", "pythonfmu", "build", "-f", "arm.py", "helper.py", cwd=folder, check=True)
+    (tmp_path / "test_arm.py").write_text(VERSIONS)
+    done = pytest_of_a_user(tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_plugin_imports_nothing_heavy(tmp_path):
     (tmp_path / "test_light.py").write_text(
         "import sys\n\ndef test_light():\n    assert not {'numpy', 'fmpy', 'pinocchio', 'rosbags'} & {*sys.modules}\n"

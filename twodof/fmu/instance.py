@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
-from itertools import accumulate, chain
+from itertools import accumulate, chain, count
 from math import inf
 from pathlib import Path
 from threading import Lock
@@ -29,6 +29,7 @@ LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERRO
 """Log levels of the FMI statuses ok, warning, discard and error; fatal is CRITICAL."""
 WARNING = fmi2.fmi2Warning
 LOADING = Lock()
+NAMES: set[str] = set()  # of living instances
 Values = Array[c_double]
 
 
@@ -56,6 +57,14 @@ def _loading() -> Iterator[None]:
             vars(fmi1)["os"] = os
 
 
+def _unique(name: str) -> str:
+    """Return the name, or the name and a number if a living instance has it, as FMI demands."""
+    with LOADING:
+        own = next(each for each in chain([name], (f"{name} {k}" for k in count(2))) if each not in NAMES)
+        NAMES.add(own)
+    return own
+
+
 class Instance:
     """An instance of an FMU; its methods must be called in the order that FMI allows.
 
@@ -70,7 +79,7 @@ class Instance:
         slave: FMPy's object, for calls that a run does not use.
     """
 
-    def __init__(self, fmu: Fmu, folder: Path) -> None:
+    def __init__(self, fmu: Fmu, folder: Path, name: str = "") -> None:
         self.fmu = fmu
         self._said = ""
         self._fatal = self._running = False
@@ -80,16 +89,18 @@ class Instance:
         for v in fmu.variables.values():
             vector = starts.setdefault((v.type, v.reference), [])
             if v.element == len(vector):  # an alias has the reference of another vector
-                vector.append(v.start_value or 0.0)
+                vector.append(v.start_value or (0.0 if v.type == "Real" else 0))
         self._starts, self._vectors = starts, deepcopy(starts)  # start and latest values by type and value reference
         identifier = fmu.description.coSimulation.modelIdentifier
+        self._name = _unique(name or identifier)
         try:
             self.slave = self._instantiate(
-                guid=fmu.guid, unzipDirectory=str(folder), modelIdentifier=identifier, instanceName=identifier
+                guid=fmu.guid, unzipDirectory=str(folder), modelIdentifier=identifier, instanceName=self._name
             )
             self._component = c_void_p(self.slave.component)
             self._step_arguments = self._component, self._t, self._h, *self._rest
         except Exception as error:  # FMPy raises bare exceptions
+            NAMES.discard(self._name)
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
 
     def _instantiate(self, **what: str) -> Any:
@@ -260,6 +271,7 @@ class Instance:
             if self._running:
                 self.slave.terminate()
         self.slave.freeInstance()
+        NAMES.discard(self._name)
 
     def _refuse(self, status: int) -> NoReturn:
         """Raise the error of a call's status, with the FMU's own message, if any."""

@@ -190,10 +190,10 @@ def _part(values: Values, first: int, size: int) -> Values:
 
 
 @contextmanager
-def instantiate_fmu(fmu: Fmu) -> Iterator[Instance]:
+def instantiate_fmu(fmu: Fmu, name: str = "") -> Iterator[Instance]:
     """Instantiate an FMU from a temporary folder, and free the instance at the end.
 
-    Its documentation is not unzipped.
+    Its documentation is not unzipped. The name of the instance is that of its model by default.
 
     Raises:
         FmuError: it has no binary for this platform, or cannot be unzipped or loaded.
@@ -207,8 +207,8 @@ def instantiate_fmu(fmu: Fmu) -> Iterator[Instance]:
         with opened(fmu) as archive:
             names = archive.namelist()
             archive.extractall(folder, [name for name in names if not name.startswith(READ)])
-        check_python_wrapper(fmu.path, folder / "binaries" / fmu.platform / fmu.library, folder)
-        instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder)
+        check_python_wrapper(fmu.path, folder / "binaries" / fmu.platform / fmu.library, folder, fmu.members)
+        instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder, name)
         try:
             yield instance
         finally:
@@ -230,7 +230,7 @@ def instantiate(fmu: Fmu) -> Iterator[Instance | SystemInstance]:
         parts = {}
         for name, part in fmu.components.items():
             with _named(name):
-                parts[name] = stack.enter_context(instantiate_fmu(part))
+                parts[name] = stack.enter_context(instantiate_fmu(part, name))
         yield SystemInstance(fmu, parts)
 
 

@@ -28,13 +28,18 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def run_fmu(tmp_path: Path) -> Callable[..., Any]:
-    """Return a function that runs an FMU, writes a bag and returns its ``Recording``; keywords as in ``twodof.run``."""
+    """Return a function that runs an FMU, writes a bag and returns its ``Recording``; keywords as in ``twodof.run``.
+
+    The bag has efforts if the FMU has outputs tau[i].
+    """
 
     def run(fmu: str | Path, **options: Any) -> Any:
         import twodof
 
         bag = tmp_path / f"run{len(list(tmp_path.glob('run*')))}"
-        twodof.run(fmu, twodof.Bag(bag, effort=True), **options)
+        loaded = twodof.load_fmu(fmu) if isinstance(fmu, str | Path) else fmu
+        known = loaded.fmu if isinstance(loaded, twodof.Experiment) else loaded
+        twodof.run(loaded, twodof.Bag(bag, effort=bool(known.vector("tau"))), **options)
         return twodof.read_bag(bag)
 
     return run
