@@ -79,12 +79,18 @@ class Point:
         rounding = ULPS * np.spacing(np.abs(rows).max(axis=0)) / width
         return Slopes((4.0 * narrow - wide) / 3.0, np.abs(narrow - wide) + rounding)
 
+    def go_on(self, instance: Instance, steps: int = 0) -> None:
+        """Do some steps and a part of a step, or a whole one if the step may not vary."""
+        trial = self._trial
+        if steps:
+            trial.rows(instance, steps)
+        varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
+        instance.step(trial.start + steps * trial.step, trial.step * (PART if varies else 1.0))
+
     def between_samples(self, instance: Instance, name: str) -> NDArray[np.bool_]:
         """Return where derivatives over an input are not those of the differences after a part of a step."""
-        trial = self._trial
-        trial.begin_again(instance, self.values)
-        varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
-        instance.step(trial.start, trial.step * (PART if varies else 1.0))
+        self._trial.begin_again(instance, self.values)
+        self.go_on(instance)
         given = instance.derivatives(self.unknowns, [name])[:, 0]
         slopes = self.slopes(instance, name, instance.set)
         return ~slopes.smooth | slopes.differ(given)
@@ -95,8 +101,7 @@ class Point:
         read, reads_state = instance.reader(self.unknowns), instance.reader([state])
         trial.begin_again(instance, self.values)
         before, at = np.array(read()), reads_state()[0]  # a later read has the same buffer
-        varies = trial.about.coSimulation.canHandleVariableCommunicationStepSize
-        instance.step(trial.start, trial.step * (PART if varies else 1.0))
+        self.go_on(instance)
         return np.asarray((np.array(read()) == before) & (reads_state()[0] != at))
 
 
@@ -113,8 +118,24 @@ def _check_sum(instance: Instance, point: Point, stated: Array) -> None:
         raise SimulationError(f"{what} is {found[k]:.9g}, and the sum of those with one seed each is {total[k]:.9g}")
 
 
+def _check_later(trial: Trial, instance: Instance, point: Point) -> None:
+    """Compare derivatives over inputs after the steps; outputs that change only in a step are not compared."""
+    names = [name for name in point.values if name in trial.inputs]
+    steps = trial.steps - 1
+    trial.begin_again(instance, point.values)
+    point.go_on(instance, steps)
+    for given, name in zip(instance.derivatives(point.unknowns, names).T, names):
+        slopes = point.slopes(instance, name, instance.set)
+        instance.set({name: point.values[name]})
+        wrong = slopes.differ(given) & (slopes.best != 0.0)
+        if wrong.any():
+            k = int(wrong.argmax())
+            what = f"∂{point.unknowns[k]}/∂{name} is {slopes.best[k]:.9g} after {steps} steps"
+            raise SimulationError(f"{what}, and it gives {given[k]:.9g}")
+
+
 def derivatives(trial: Trial) -> str:
-    """Compare directional derivatives with central differences.
+    """Compare directional derivatives with central differences, at the start and, over inputs, after the steps.
 
     Inputs and states are changed before initialisation. If the initialisation takes a sample, as that of a sampled
     controller, its differences are no derivatives; inputs are then changed between two samples, after a part of a step,
@@ -150,6 +171,7 @@ def derivatives(trial: Trial) -> str:
                 if name in trial.inputs or not samples:
                     raise SimulationError(text)
                 doubtful = doubtful or text
+        _check_later(trial, instance, point)
     if doubtful:
         raise UnpassedError("remark", f"{doubtful}; the first may contain a sample that the initialisation takes")
     if stated.size == jumps:

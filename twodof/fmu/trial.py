@@ -35,6 +35,7 @@ class Trial:
 
     Attributes:
         start, step: start time and step of its default experiment, s.
+        steps: number of steps of a run, which ends at the stop time of the default experiment at the latest.
         variables: FMPy's descriptions of real variables, by the names of their elements.
         outputs, inputs: names of real outputs and continuous inputs.
         starts: start values of real inputs and parameters that have one.
@@ -48,6 +49,8 @@ class Trial:
         )
         self.start = float(start or 0.0)
         self.step = float(step or (float(stop) - self.start if stop else 5.0) / 500)
+        length = inf if stop is None else (float(stop) - self.start) / self.step
+        self.steps = int(max(2.0, min(STEPS, length + 1e-6)))
         self.variables: dict[str, ModelVariable] = {
             scalar.name: v for v in self.about.modelVariables for scalar in scalars(v) if scalar.type == "Real"
         }
@@ -95,11 +98,11 @@ class Trial:
         instance.reset()
         instance.initialise(self.start, inf, values or {})
 
-    def rows(self, instance: Instance, count: int = STEPS, first: int = 0) -> list[Outputs]:
-        """Return the outputs after each of ``count`` steps from step ``first`` on."""
+    def rows(self, instance: Instance, count: int = 0, first: int = 0) -> list[Outputs]:
+        """Return the outputs after each of ``count`` steps from step ``first`` on; 0: those of a run."""
         rows: list[Outputs] = []
         read = self.reader(instance)
-        for k in range(first, first + count):
+        for k in range(first, first + (count or self.steps)):
             self.note(f"step {k + 1}")
             instance.step(self.start + k * self.step, self.step)
             rows.append(read())

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import accumulate
 from math import inf, isfinite
 from typing import Any
 
@@ -21,7 +22,7 @@ from .importers import TOOLS, Run, in_this_master
 from .instance import Instance
 from .reference_runs import Reference
 from .system_instance import instantiate_fmu
-from .trial import DELTA, STEPS, Trial, UnpassedError
+from .trial import DELTA, Outputs, Trial, UnpassedError
 
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 """Sizes of variable steps, as multiples of the default step."""
@@ -34,7 +35,7 @@ def simulation(trial: Trial) -> str:
     """Do the steps of the default experiment, and read the outputs twice at the end."""
     with trial.instance() as instance:
         trial.compare(trial.rows(instance)[-1:], [trial.reader(instance)()], "in a second read at one time")
-    return f"{STEPS} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
+    return f"{trial.steps} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
 
 
 def start_values(trial: Trial) -> str:
@@ -90,7 +91,7 @@ def two_instances(trial: Trial) -> str:
             instance.free()
         trial.note("a second instance")
         pair = [begun(values) for values in given]
-        for k in range(STEPS):
+        for k in range(trial.steps):
             for instance, rows in zip(pair, alone):
                 trial.compare(rows[k : k + 1], trial.rows(instance, 1, k), "beside a second instance")
         for instance in pair:
@@ -101,30 +102,41 @@ def two_instances(trial: Trial) -> str:
 def state(trial: Trial) -> str:
     """Save the state, step, restore it and step again."""
     trial.require("canGetAndSetFMUstate")
-    return _restored(trial, lambda slave, saved: saved)
+    with trial.instance(trial.changed_inputs()) as instance:
+        saved, rows = _saved(trial, instance)
+        instance.set({name: trial.starts[name] for name in trial.inputs if name in trial.starts})
+        return _restored(trial, instance, saved, rows)
 
 
 def serialised_state(trial: Trial) -> str:
-    """Restore a serialised state."""
+    """Restore a serialised state in a new instance, after the old one and its state were freed."""
     trial.require("canGetAndSetFMUstate", "canSerializeFMUstate")
-    return _restored(trial, lambda slave, saved: slave.deserializeFMUState(bytes(slave.serializeFMUState(saved))))
-
-
-def _restored(trial: Trial, converted: Callable[[Any, Any], Any]) -> str:
-    half = STEPS // 2
-    trial.require_outputs()
     with trial.instance(trial.changed_inputs()) as instance:
-        trial.rows(instance, half)
-        trial.note("saving the state")
-        saved, read = instance.slave.getFMUState(), trial.reader(instance)
-        before = read()
-        once = trial.rows(instance, half, half)
-        instance.set({name: trial.starts[name] for name in trial.inputs if name in trial.starts})
-        trial.note("restoring the state")
-        instance.slave.setFMUState(converted(instance.slave, saved))
-        trial.compare([before], [read()], "at the restored state")
-        trial.compare(once, trial.rows(instance, half, half), "after the state was restored")
+        saved, rows = _saved(trial, instance)
+        content = bytes(instance.slave.serializeFMUState(saved))
         instance.slave.freeFMUState(saved)
+    with trial.instance() as instance:
+        return _restored(trial, instance, instance.slave.deserializeFMUState(content), rows) + " in a new instance"
+
+
+def _saved(trial: Trial, instance: Instance) -> tuple[Any, list[Outputs]]:
+    """Return the state after half of the steps, and the outputs then and after each further step."""
+    trial.require_outputs()
+    half = trial.steps // 2
+    trial.rows(instance, half)
+    trial.note("saving the state")
+    saved, before = instance.slave.getFMUState(), trial.reader(instance)()
+    return saved, [before, *trial.rows(instance, half, half)]
+
+
+def _restored(trial: Trial, instance: Instance, saved: Any, rows: Sequence[Outputs]) -> str:
+    """Restore and free a state, and compare the outputs with those after it was saved."""
+    half = trial.steps // 2
+    trial.note("restoring the state")
+    instance.slave.setFMUState(saved)
+    trial.compare(rows[:1], [trial.reader(instance)()], "at the restored state")
+    trial.compare(rows[1:], trial.rows(instance, half, half), "after the state was restored")
+    instance.slave.freeFMUState(saved)
     return f"save, {half} steps, restore, {half} steps: equal"
 
 
@@ -133,12 +145,14 @@ def variable_steps(trial: Trial) -> str:
     trial.require("canHandleVariableCommunicationStepSize")
     grain = float(getattr(trial.about.coSimulation, "fixedInternalStepSize", None) or 0.0)
     h = max(1, round(trial.step / 4.0 / grain)) * grain * 4.0 if grain else trial.step
+    lengths = [*accumulate(SIZES)]
+    sizes = SIZES[: 1 + max(k for k, length in enumerate(lengths) if length <= trial.steps and length.is_integer())]
     with trial.instance() as instance:
         ends = []
-        for sizes in ([1.0] * round(sum(SIZES)), SIZES):
+        for run in ([1.0] * round(sum(sizes)), sizes):
             trial.begin_again(instance)
             done = 0.0
-            for size in sizes:
+            for size in run:
                 trial.note(f"a step of {size * h:g} s")
                 try:
                     instance.step(trial.start + done * h, size * h)
@@ -151,7 +165,8 @@ def variable_steps(trial: Trial) -> str:
     away = max((abs(a - b) for a, b in zip(*ends)), default=0.0)
     if not isfinite(away):
         raise SimulationError("with variable steps an output is not finite")
-    return f"steps of 1/4 to 3 times {h:g} s; outputs end at most {away:.2g} from those of equal steps"
+    steps = f"steps of {min(sizes):g} to {max(sizes):g} times {h:g} s"
+    return f"{steps}; outputs end at most {away:.2g} from those of equal steps"
 
 
 def inputs(trial: Trial) -> str:
