@@ -61,7 +61,7 @@ def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescrip
 
 
 def _complete(description: ModelDescription, root: ET.Element) -> None:
-    """Insert the attributes of variables that FMPy leaves out: relativeQuantity, and those of declared types."""
+    """Add the attributes of variables that FMPy leaves out: relativeQuantity, and those of declared types."""
     variables = [(v.get("name"), each) for v in root.iterfind("ModelVariables/*") for each in (v, *v)]
     stated = {name: each.get(RELATIVE) in TRUE for name, each in variables if RELATIVE in each.attrib}
     for variable in description.modelVariables:
