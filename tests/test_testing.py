@@ -124,6 +124,24 @@ def test_a_users_tests_have_fixtures_messages_and_plots(tmp_path, native_path):
     assert plot.read_text().count("<polyline") == 1
 
 
+def test_each_failed_test_has_its_own_plot(tmp_path, native_path):
+    """Names of tests may be equal after their last slash, in two folders, or in their first 100 characters."""
+    text = f"""
+import pytest
+from twodof.testing import assert_settles
+
+@pytest.mark.parametrize("name", ["arm/x", "leg/x", "{"n" * 100}1", "{"n" * 100}2"])
+def test_late(run_fmu, name):
+    assert_settles(run_fmu({str(native_path)!r}, stop_time=1.0), within=0.1)
+"""
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "__init__.py").write_text("")
+        (tmp_path / folder / "test_arm.py").write_text(text)
+    done = pytest_of_a_user(tmp_path, "--twodof-report", "report")
+    assert "8 failed" in done.stdout and len([*(tmp_path / "report").iterdir()]) == 8, done.stdout
+
+
 ARM = """
 from helper import ACCELERATION
 from pythonfmu import Fmi2Causality, Fmi2Slave, Real

@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
+from zlib import crc32
 
 if TYPE_CHECKING:
     import numpy as np
@@ -134,8 +135,9 @@ def _fail(bag: Recording, text: str, curves: Sequence[Any], label: str = "") -> 
         from ..notebook import card, picture
 
         test = os.environ.get("PYTEST_CURRENT_TEST", "run").rpartition(" ")[0] or "run"
-        name = re.sub(r"[^\w.-]+", "_", test.rpartition("/")[2])
-        path = REPORT[-1] / f"{name[:100]}.html"
+        name = re.sub(r"[^\w.-]+", "_", test)
+        short = name if len(name) <= 100 else f"{name[:90]}_{crc32(test.encode()):08x}"
+        path = REPORT[-1] / f"{short}.html"
         path.parent.mkdir(parents=True, exist_ok=True)
         plot = picture(((bag.t, curve) for curve in curves), "t in s", label)
         page = f'<!DOCTYPE html><meta charset="utf-8">{card(test, {"bag": bag.path, "failure": text}, plot)}'
