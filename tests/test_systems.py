@@ -291,6 +291,20 @@ def test_only_a_target_in_si_units_that_drives_the_robot_is_its_target(plant: by
         assert (twodof.run(path, step=H, stop_time=N * H).verdict.outcome != "no target") == is_target
 
 
+def test_the_guid_of_a_system_depends_on_its_parameter_sets_and_the_files_of_its_fmus(
+    plant: bytes, pd: bytes, tmp_path: Path
+) -> None:
+    with zipfile.ZipFile(io.BytesIO(pd)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    rebuilt = zipped({**files, "resources/gains": b"2"})
+    own = BOTH.replace(component("pd"), component("pd", binding(attributes='source="pd.ssv"')))
+    guids = []
+    for fmu, gain in ((pd, 1), (pd, 2), (rebuilt, 1), (pd, 1)):
+        path = loop(tmp_path / "loop.ssp", plant, fmu, ssd(own), **{"pd.ssv": values(f"Kp Real {gain}").encode()})
+        guids.append(twodof.load_fmu(path).guid)
+    assert len({*guids}) == 3 and guids[0] == guids[3]
+
+
 def test_a_run_has_the_times_of_the_default_experiment(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     wired = f"{BOTH}<ssd:Connections>{WIRES}</ssd:Connections>"
     for times, expected in (('startTime="1" stopTime="1.5"', (1.0, 1.5)), ('startTime="-1"', (-1.0, 4.0))):

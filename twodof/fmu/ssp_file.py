@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -123,7 +124,7 @@ class Element:
 
 
 def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
-    """Return name, top system, default experiment and the text of the structure of an SSP file.
+    """Return name, top system, default experiment and the SHA-256 of structure and parameter sets of an SSP file.
 
     Raises:
         FmuError: the file is damaged, unsafe or invalid, or has an unsupported feature, which the message names.
@@ -150,7 +151,7 @@ def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
             default = root.find(f"{SSD}DefaultExperiment")
             times = {} if default is None else default.attrib
             experiment = DefaultExperiment(startTime=times.get("startTime"), stopTime=times.get("stopTime"))
-            return root.get("name", ""), system, experiment, archive.read(STRUCTURE)
+            return root.get("name", ""), system, experiment, file.digest.digest()
     except OSError as error:
         raise FmuError(f"cannot read '{path}': {error.strerror or error}") from error
     except ZIP_ERRORS as error:
@@ -162,6 +163,7 @@ class _File:
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self._path, self._archive, self._names, self._room = path, archive, {*archive.namelist()}, MAX_DESCRIPTION
+        self.digest = sha256()
 
     def xml(self, name: str, kind: str) -> ET.Element:
         """Return the root of an XML member, validated by its schema."""
@@ -170,6 +172,7 @@ class _File:
         content = read_member(self._archive, name, MAX_DESCRIPTION)
         if not is_plain_xml(content):
             raise FmuError(f"'{self._path}': {name} declares entities or is not UTF-8")
+        self.digest.update(content)
         return self._checked(content, name, kind)
 
     def _checked(self, content: bytes, name: str, kind: str) -> ET.Element:

@@ -32,7 +32,7 @@ class System(Fmu):
 
     Attributes:
         description: that of the robot's FMU, with the system's name, default experiment, and as GUID the SHA-256 of its
-            structure and its FMUs' digests.
+            structure, its parameter sets, and the GUIDs and checksums of its FMUs.
         components: FMUs by full name.
         links: connections of components' variables with their first sources.
         batches: outputs and inputs in the order of evaluation at one instant.
@@ -134,7 +134,7 @@ def load_system(path: Path, robot: str = "") -> System:
     variables, places = _variables(path, wiring, fmus, links, starts, chosen, _measuring(fmus, links, chosen))
     digest = hashlib.sha256(structure)
     for fmu in by_source.values():
-        digest.update(fmu.guid.encode() + b"\0")
+        digest.update(f"{fmu.guid} {sorted(fmu.members.items())}\0".encode())
     own: dict[str, Any] = {each.name: getattr(fmus[chosen], each.name) for each in fields(Fmu)}
     description = copy(fmus[chosen].description)
     description.modelName, description.guid, description.defaultExperiment = title, digest.hexdigest(), times
