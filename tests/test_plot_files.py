@@ -25,7 +25,7 @@ from recordings import LINK, chain_urdf, long_run, third_party_bag, waves
 import twodof
 from twodof.cli.main import main
 from twodof.errors import PlotError, TwoDofError
-from twodof.plots.figure import Plot, file_kind, save
+from twodof.plots.figure import Plot, draw_head, file_kind, save
 from twodof.plots.panels import with_joints
 from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
@@ -34,6 +34,17 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path
 
 
 # --- what a reader sees ---
+
+
+def test_long_texts_above_the_panels_are_cut():
+    """Their number and length are those in an untrusted bag."""
+    figure = Figure()
+    draw_head(figure, "title", ["short", *["w " * 30_000] * 1000], (8.0, 4.0))
+    (legend,) = figure.subfigs[0].legends
+    first, *others = legend.get_title().get_text().splitlines()
+    assert first == "short" and 10 < len(others) < 200
+    assert others[9].endswith(" …") and max(map(len, others)) < 200
+    assert figure.get_figheight() < 40
 
 
 def test_figures_are_legible(gains, changing, foreign, ur5, tmp_path):

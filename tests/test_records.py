@@ -219,6 +219,7 @@ def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path, capsys):
         ("", (0, 0, 0), "has 0 positions for 0 joints"),
         ("ab", (2, 1, 2), "has 1 and 2 velocities and efforts for 2 joints"),
         ("aa", (2, 0, 0), "has two joints 'a'"),
+        (["a", "b" * 1001], (2, 0, 0), "has a joint with a name of more than 1000 characters"),
     ],
 )
 def test_joint_states_have_as_many_numbers_as_joints(bag, names, sizes, said, tmp_path, capsys):
@@ -418,6 +419,17 @@ def test_hostile_provenance_is_refused(native_path, tmp_path, content, capsys):
         sink.write(sample(run, 0))
     (bag / "run.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     assert "run.json" in refused(capsys, bag)
+
+
+@pytest.mark.parametrize("change", [{"robot": "r" * 1001}, {"joints": ["j" * 1001, "b"]}, {"fmu": "f" * 1001}])
+def test_long_names_in_a_provenance_are_refused(native_path, tmp_path, change, capsys):
+    bag = tmp_path / "bag"
+    twodof.simulate(native_path, twodof.Bag(bag), stop_time=0.1)
+    facts = json.loads((bag / "run.json").read_text())
+    (bag / "run.json").write_text(
+        json.dumps({**facts, **change, "fmu": {**facts["fmu"], "file": change.get("fmu", "")}})
+    )
+    assert "run.json': it has a name of more than 1000 characters" in refused(capsys, bag)
 
 
 @pytest.mark.parametrize("output", ["x.html", "x.png"])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bounds import MAX_JOINT_STATE, MAX_ODD, MIB
+from ..bounds import MAX_JOINT_STATE, MAX_NAME, MAX_ODD, MIB
 from ..errors import BagError
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
 from ..ros.messages import JOINT_STATE, store_of
@@ -98,6 +98,8 @@ class JointStates:
         if len({*names}) < positions:
             twice = next(name for name, count in Counter(names).items() if count > 1)
             raise BagError(f"'{self._path}' has two joints '{twice}'")
+        if max(map(len, names)) > MAX_NAME:
+            raise BagError(f"'{self._path}' has a joint with a name of more than {MAX_NAME} characters")
         return names
 
     def _decode_one(self, message: Rows) -> tuple[str, list[Array]]:

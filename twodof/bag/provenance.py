@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
-from ..bounds import CHANGE, MAX_HELD, MAX_PROVENANCE, MAX_ROBOTS
+from ..bounds import CHANGE, MAX_HELD, MAX_NAME, MAX_PROVENANCE, MAX_ROBOTS
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..fmu import System
@@ -45,6 +45,8 @@ SHAPE = {
     "input_changes": [(NUMBER, VALUES)],
 }
 """Shape of a valid run.json, for ``fits``."""
+NAMES = ("name", "file", "robot", "frame", "root")
+"""Keys of the names in it and in its facts of the FMU."""
 
 
 class Provenance(TypedDict, total=False):
@@ -243,6 +245,9 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
             if not fits(content, SHAPE) or not fits(content.get(KNOWN_UNTIL, 0.0), NUMBER):
                 raise ValueError("it is damaged")
+            facts = {**content, **content["fmu"]}
+            if max(map(len, (*content["joints"], *(facts[key] for key in NAMES)))) > MAX_NAME:
+                raise ValueError(f"it has a name of more than {MAX_NAME} characters")
             if len({*content["axes"]} & {*"xyz"}) < len(content["axes"]):
                 raise ValueError(f"its axes '{content['axes']:.50}' are not different letters of 'xyz'")
             return _limited(cast(Provenance, content))

@@ -7,7 +7,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from itertools import chain
+from itertools import chain, islice
 from math import ceil
 from pathlib import Path
 from string import Template
@@ -54,6 +54,7 @@ STYLE = {
     "pdf.fonttype": 42,
 }
 LETTER = 0.058  # inches, mean width
+MOST_TEXTS, MOST_LINES = 20, 10  # above the panels, and of each text
 TICK_STYLE: Style = {
     "direction": "in",
     "width": 0.7,
@@ -151,7 +152,7 @@ def draw_head(
 ) -> SubFigure:
     """Draw a title, texts and a legend; return the subfigure for the panels, of a size in inches."""
     letters = int((size[0] - 0.3) / LETTER)
-    lines = [line for text in texts for line in textwrap.wrap(text, letters)]
+    lines = [line for text in islice(texts, MOST_TEXTS) for line in _wrapped(text, letters)]
     for handle in handles:
         handle.set_label(_end(str(handle.get_label()), int(0.8 * letters) - 10))
     longest = max((len(str(handle.get_label())) for handle in handles), default=0)
@@ -175,6 +176,11 @@ def draw_head(
     )
     legend.get_title().set_color(GREY)
     return room
+
+
+def _wrapped(text: str, letters: int) -> list[str]:
+    """Return a text in lines, without the end of a long text: Matplotlib takes a second for 300 lines."""
+    return textwrap.wrap(text[: (MOST_LINES + 1) * letters], letters, max_lines=MOST_LINES, placeholder=" …")
 
 
 def _end(text: str, letters: int) -> str:
