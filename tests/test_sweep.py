@@ -189,6 +189,10 @@ def test_a_name_without_an_index_sets_all_elements(native_path):
         ([], "there is nothing to vary"),
         (["--grid", "Kp=1:2:3", "--stop-time", "-1"], "stop time -1 s must be after"),
         (["--grid", "Kp=1:2:99999", "--grid", "Kd=1:2:99"], "runs; at most"),
+        (
+            [*(f"--range=v{i}=1:2" for i in range(17)), "--random", "1000000"],
+            "a table of 1000000 runs over 17 variables exceeds 256 MiB",
+        ),
         (["--grid", "limit_effort=0:1:2"], "limit_effort = 0.0: expected true or false"),
         (["--grid", "Kp=1:2:3", "--resume"], "--resume has no effect without -o"),
         (["--grid", "Kp=1:2:3", "--resume", "-o", "none"], "there is no sweep 'none' to resume"),

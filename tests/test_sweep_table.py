@@ -175,6 +175,16 @@ def of_one_text(table: pa.Table) -> pa.Table:
     return rows.replace_schema_metadata({b"twodof": json.dumps(provenance)})
 
 
+def of_equal_numbers(table: pa.Table) -> pa.Table:
+    """Hundreds of columns of one number, which take no room in the file and more in memory than a table may have."""
+    runs = 120_000
+    made = varying(table, 300)
+    schema = described(made, "design", {**json.loads(made.schema.metadata[b"twodof"])["design"], "draws": runs}).schema
+    one, text = pa.array(np.ones(runs)), pa.array(["finished"]).take(pa.array(np.zeros(runs, np.int32)))
+    kinds = {pa.int64(): pa.array(range(runs)), pa.string(): text}
+    return pa.Table.from_arrays([kinds.get(field.type, one) for field in schema], schema=schema)
+
+
 def store(table: pa.Table, path: Path) -> None:
     """Write a table as another writer without Arrow's dictionaries does."""
     with pq.ParquetWriter(path, table.schema, store_schema=False) as writer:
@@ -232,6 +242,7 @@ HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
     "a message that is not UTF-8": lambda table: changed(table, "message", not_utf8()),
     "endless": endless,
     "one text for all": of_one_text,
+    "one number for all": of_equal_numbers,
 }
 
 

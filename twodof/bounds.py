@@ -13,7 +13,7 @@ MAX_FOLDERS_DEEP = 50  # nested folders
 # FMUs
 MAX_DESCRIPTION = 8 * MIB  # some 50,000 variables; of a system: structure, parameter sets and mappings together
 MAX_ELEMENTS = 50_000  # elements of all arrays of FMI 3.0, including aliases
-MAX_NAME = 1000  # characters of the name of a variable, component or topic
+MAX_NAME = 1000  # characters of the name of a variable, component, topic or joint
 MAX_DIMENSIONS = 16  # dimensions of an array of FMI 3.0; a matrix has 2
 MAX_COMPONENTS = 100  # FMUs and systems in a system, and connections in a row
 MAX_DESCRIPTIONS = 16 * MIB  # descriptions of all components of a system
@@ -93,10 +93,10 @@ MAX_DEFINITIONS = 256 * KIB  # message types without a hash; the hash of one of 
 MAX_RUNS = 1_000_000
 MAX_VARIED = 300  # varied variables; a figure of all takes 0.03 s for each
 MAX_SETTINGS = 10_000
-MAX_SWEEP = 512 * MIB  # the table in memory: a million runs, each with a message
+MAX_SWEEP = 256 * MIB  # the table in memory, of which reading makes four: a million runs of 16 varied variables
 
 # figures and pages
-MAX_PANELS = 256  # of a figure; Matplotlib takes 0.1 s for one
+MAX_PANELS = 256  # of a figure; Matplotlib takes 0.15 s for one
 MAX_FRAMES = 200_000  # of a film, some hours of work
 MAX_STYLES = 1 * MIB  # a matplotlibrc in the working directory; matplotlib's own has 43 KB
 MAX_HEAD = 64 * KIB  # beginning of a file that identifies a page

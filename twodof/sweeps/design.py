@@ -8,10 +8,13 @@ from math import isfinite, prod
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_RUNS
+from ..bounds import MAX_RUNS, MAX_SWEEP, MIB
 from ..errors import InputError
 from ..fmu import Fmu
 from ..simulation.input_values import Setting, resolve
+from ..simulation.verdict import METRICS
+
+OTHERS = 4  # columns of a table besides variables and metrics
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,9 @@ def make_design(
     design = Design(grids, limits, max(1, random), seed)
     if len(design) > MAX_RUNS:
         raise InputError(f"the design has {len(design)} runs; at most {MAX_RUNS} are possible")
+    if 8 * len(design) * (len(grids) + len(limits) + len(METRICS) + OTHERS) > MAX_SWEEP:
+        varied = f"{len(design)} runs over {len(grids) + len(limits)} variables"
+        raise InputError(f"a table of {varied} exceeds {MAX_SWEEP // MIB} MiB; vary fewer, or in several sweeps")
     owner = dict.fromkeys(resolve(fmu, settings), "the settings")
     for name, values in {**grids, **limits}.items():
         if not values:

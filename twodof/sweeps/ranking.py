@@ -34,15 +34,14 @@ def ranks(values: Array) -> NDArray[np.int64]:
 
     NaN has the last rank.
     """
-    order = np.argsort(values, kind="stable")
+    distinct, place = np.unique(values, return_inverse=True)
     begins, most = [], -inf
-    for value in values[order].tolist():
+    for value in distinct.tolist():
         begins.append(value > most)  # NaN never begins a rank
         if begins[-1]:
             most = value + ROUNDING * max(1.0, abs(value))
-    ranks = np.empty(len(values), np.int64)
-    ranks[order] = np.cumsum(begins, dtype=np.int64) - 1 + np.isnan(values[order])
-    return ranks
+    rank: NDArray[np.int64] = np.cumsum(begins, dtype=np.int64) - 1 + np.isnan(distinct)
+    return rank[place]
 
 
 def beyond_limits(table: pandas.DataFrame) -> pandas.Series:

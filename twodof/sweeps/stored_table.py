@@ -38,6 +38,7 @@ SHAPE: dict[str, Any] = {
 """Shape of a valid provenance."""
 OUTCOMES = ("finished", "discarded", "diverged", "failed", "crashed")
 TEXTS = ["outcome", "message"]
+NUMBER_SIZE = 8  # bytes in memory
 
 
 def schema_of(names: Sequence[str], units: Sequence[str], provenance: dict[str, object]) -> pa.Schema:
@@ -117,10 +118,11 @@ def _check_schema(file: Path, schema: pa.Schema) -> int:
 
 
 def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> None:
-    """Refuse a table whose stated size exceeds the limit, before reading it."""
+    """Refuse a table whose stated size exceeds the limit, before reading it; equal values are stored once."""
     groups = [content.row_group(i) for i in range(content.num_row_groups)]
     size = sum(g.column(j).total_uncompressed_size for g in groups for j in range(g.num_columns))
-    if size > room or sum(group.num_rows for group in groups) > runs:
+    rows = sum(group.num_rows for group in groups)
+    if max(size, NUMBER_SIZE * rows * content.num_columns) > room or rows > runs:
         raise _damaged(file)
 
 
