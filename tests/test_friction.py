@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from friction_oracle import Rubbing
-from native_models import Engine, Model, Reduced, engine, from_urdf, model
+from native_models import Engine, Model, Reduced, engine, from_urdf, model, urdf_path
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 SLIDER = """<robot name="slider"><link name="base"/><link name="body"><inertial><mass value="2"/>
@@ -275,3 +275,42 @@ def test_friction_and_stops_do_not_depend_on_the_communication_step(rigid):
         runs.append(np.array([np.r_[q, v] for q, v in rows[parts - 1 :: parts]]))
     for other in runs[1:]:
         np.testing.assert_allclose(other, runs[0], rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("python", [False, True])
+@pytest.mark.parametrize("friction", [0.005, 0.2, 5.0])
+def test_a_clamped_joint_without_a_range_falls_against_its_friction(friction, python):
+    """By Pinocchio: the other joint accelerates as if this one slipped against its friction or, if it can, rested."""
+    native, text = engine("twodof", "effort"), urdf_path("twodof").read_text("utf-8")
+    plant = native.model.plant()
+    plant.gravity, plant.friction, plant.rigid_stops = [0.0, -9.81, 0.0], [0.0, friction], False
+    plant.q, plant.v, plant.tau_cmd = [0.5, 0.35], [0.0, 0.0], [0.0, 0.0]
+    plant.q_min[1] = plant.q_max[1] = 0.35
+    plant.prepare()
+    reference = pin.buildModelFromXML(text)
+    reference.gravity.linear = np.array(plant.gravity)
+    data, q = reference.createData(), np.array(plant.q)
+    M, h = pin.crba(reference, data, q), pin.computeGeneralizedGravity(reference, data, q)
+    M = np.triu(M) + np.triu(M, 1).T
+    held = -h[0] / M[0, 0]
+    holding = M[1, 0] * held + h[1]
+    falling = np.linalg.solve(M, -h + [0.0, np.sign(holding) * friction])[0]
+    expected = held if abs(holding) <= friction else falling
+    h = 1e-4
+    ((_, v),) = states(native, plant, h, 1, python=python)
+    assert v[0] == pytest.approx(expected * h, rel=1e-4) and v[1] == 0.0
+
+
+@pytest.mark.parametrize("python", [False, True])
+def test_a_clamped_joint_without_a_range_moves_others_as_one_with_the_smallest_range(python):
+    """Its friction holds it at times, and it slips in both directions."""
+    ends = []
+    for top in (0.35, 0.35 + 1e-9):
+        native = engine("twodof", "effort")
+        plant = native.model.plant()
+        plant.gravity, plant.friction, plant.rigid_stops = [0.0, -9.81, 0.0], [0.0, 0.05], False
+        plant.q, plant.q_min[1], plant.q_max[1], plant.tau_cmd = [0.5, 0.35], 0.35, top, [0.0, 0.0]
+        plant.v, plant.rtol, plant.atol = [0.0, 0.0], 1e-10, 1e-12
+        plant.prepare()
+        ends.append([q[0] for q, _ in states(native, plant, 0.01, 60, python=python)])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)

@@ -44,7 +44,7 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
 {
     const double *q = &plant->value[Q], *v = &plant->value[V];
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
-    double a[N_JOINTS], effort[N_JOINTS];
+    double a[N_JOINTS], effort[N_JOINTS] = {0};
     if (stops->any_watched || stops->any_slip) {
         acceleration(plant, q, v, slip_of(stops), stops->rank, a, NULL);
         restrain(plant, stops, q, a, effort);
@@ -52,7 +52,8 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
     const double rounding = stops->any_watched ? rounding_of(stops, effort) : 0.0;
     for (int i = 0; i < N_JOINTS; i++) {
         double *at[2] = {&indicator[i], &indicator[N_JOINTS + i]}, *friction = &indicator[2 * N_JOINTS + i];
-        const int slip = stops->held[i] ? 0 : stops->slip[i], side = is_above(plant, q[i], i) ? 1 : -1;
+        const int slip = stops->held[i] ? 0 : stops->slip[i];
+        const double grips[2] = {grip(plant, stops, i, q[i], effort[i], 1), grip(plant, stops, i, q[i], effort[i], -1)};
         *friction = slip ? slip * v[i] + BACK + CLEARING * fmax(0.0, slip * a[i]) : 1.0;
         if (CHANGES_FRICTION && !stops->slip[i] && !reacts(stops, i))
             *friction = PULL - plant->value[FRICTION + i];
@@ -60,11 +61,10 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
         *at[1] = room(low[i], q[i] - low[i], v[i]);
         if (stops->held[i]) /* a joint without a range stays at rest */
             *at[0] = *at[1] = 1.0;
-        if (stops->watched[i] && stops->held[i] != STUCK)
-            *at[side > 0 ? 0 : 1] = grip(plant, stops, i, q[i], effort[i], side) + PULL + rounding;
-        else if (stops->watched[i])
-            *friction = fmin(grip(plant, stops, i, q[i], effort[i], -1), grip(plant, stops, i, q[i], effort[i], 1))
-                    + PULL * plant->value[FRICTION + i] + rounding;
+        for (int k = 0; k < 2 && stops->watched[i] && stops->held[i] != STUCK; k++)
+            *at[k] = grips[k] < HUGE_VAL ? grips[k] + PULL + rounding : 1.0;
+        if (stops->watched[i] && stops->held[i] == STUCK)
+            *friction = fmin(grips[0], grips[1]) + PULL * plant->value[FRICTION + i] + rounding;
     }
 #ifdef HAS_RCOND
     double ratio[N_ROWS];

@@ -84,6 +84,11 @@ typedef struct {
     int at;           /* active bound: −1 or 1; 0 if the joint rests */
 } Contact;
 
+static int has_no_range(const Plant *plant, int i)
+{
+    return plant->value[Q_MIN + i] == plant->value[Q_MAX + i];
+}
+
 /* Find the joints at limits; stops of joints without a range, and of those in kept, act in both directions. */
 static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int kept[N_JOINTS],
                           Contact contact[N_JOINTS])
@@ -91,7 +96,7 @@ static void find_contacts(const Plant *plant, const double q[N_JOINTS], const in
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     for (int i = 0; i < N_JOINTS; i++) {
         const double side = q[i] >= high[i] ? -1.0 : q[i] <= low[i] ? 1.0 : 0.0;
-        const Contact own = {.there = side != 0.0, .fixed = kept[i] || low[i] == high[i], .side = side,
+        const Contact own = {.there = side != 0.0, .fixed = kept[i] || has_no_range(plant, i), .side = side,
                              .low = side < 0.0 ? -HUGE_VAL : 0.0, .high = side > 0.0 ? HUGE_VAL : 0.0};
         contact[i] = own;
     }
@@ -226,8 +231,7 @@ static int stop_within(const Plant *plant, double window, double y[N_STATES], co
     return 1;
 }
 
-/* Add friction to the bounds of joints at rest; return whether any joint may rest. The friction of a clamp that holds
-   in any case, or of a joint without a range, has no effect. */
+/* Add friction to the bounds of joints at rest, which clamps do not have; return whether any joint may rest. */
 static int add_friction(const Plant *plant, const double v[N_JOINTS], Contact contact[N_JOINTS])
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
@@ -235,9 +239,10 @@ static int add_friction(const Plant *plant, const double v[N_JOINTS], Contact co
     for (int i = 0; i < N_JOINTS; i++) {
         Contact *own = &contact[i];
         const int clamps = own->side != 0.0 && !rigid;
-        const double friction = clamps && own->fixed ? 0.0 : plant->value[FRICTION + i];
+        const double friction = clamps && own->fixed && !has_no_range(plant, i) ? 0.0 : plant->value[FRICTION + i];
         any |= v[i] == 0.0 && (friction > 0.0 || own->there); /* other joints move away */
         own->there = v[i] == 0.0 && (friction > 0.0 || (own->there && rigid));
+        own->fixed &= !clamps;
         own->low = (clamps ? 0.0 : own->low) - friction;
         own->high = (clamps ? 0.0 : own->high) + friction;
     }
@@ -294,14 +299,15 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
         const Contact *own = &contact[i];
         const int rests = own->there && stopped[i] == 0.0;
         const int clamps = !rigid && own->side != 0.0 && v[i] == 0.0 && !rests;
-        if (clamps && (own->fixed || own->side * stopped[i] <= 0.0))
+        if (clamps && (kept[i] || has_no_range(plant, i) || own->side * stopped[i] <= 0.0))
             stops->held[i] = CLAMPED;
         else if (rests)
             stops->held[i] = own->side != 0.0 && rigid ? STOPPED : STUCK;
         if (own->there && !rests && plant->value[FRICTION + i] > 0.0)
             stops->slip[i] = -own->at;
         stops->any_slip |= stops->slip[i] != 0;
-        stops->watched[i] = stops->held[i] && !own->fixed;
+        const int acts_alike = rigid || (stops->held[i] == CLAMPED && !stops->slip[i]); /* whatever the efforts are */
+        stops->watched[i] = stops->held[i] && !kept[i] && !(has_no_range(plant, i) && acts_alike);
         stops->any_held |= stops->held[i] != FREE;
         stops->any_watched |= stops->watched[i];
     }
@@ -318,7 +324,8 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
 INTERNAL double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side)
 {
     const double friction = stops->held[i] == CLAMPED ? 0.0 : plant->value[FRICTION + i];
-    if (stops->held[i] != STUCK && is_above(plant, q, i) == (side < 0))
+    const int pressed = has_no_range(plant, i) ? stops->slip[i] : is_above(plant, q, i) ? 1 : -1;
+    if (stops->held[i] != STUCK && side != pressed)
         return HUGE_VAL;
     return friction - side * effort;
 }

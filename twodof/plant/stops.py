@@ -132,14 +132,15 @@ class Stops:
         clamps = {i for i in sides if y[n + i] == 0.0 and not self.rigid}
         bounds = {}
         for i in range(n):
-            friction = 0.0 if i in clamps and i in locked else self._friction[i]
+            briefly = i in clamps and kept[i] and not self._has_no_range(i)
+            friction = 0.0 if briefly else self._friction[i]
             if y[n + i] == 0.0 and (friction or (i in sides and self.rigid)):
                 side = sides.get(i, 0.0) if self.rigid else 0.0
                 bounds[i] = -inf if side < 0.0 else -friction, inf if side > 0.0 else friction
         stopped, at = a, dict.fromkeys(bounds, 0)
         if bounds:
             W = self._inverse_mass(y[:n])
-            acting, at = _complementary(W, a, bounds, [i for i in bounds if i in locked])
+            acting, at = _complementary(W, a, bounds, [i for i in bounds if i in locked and i not in clamps])
             stopped = (W @ acting + a).tolist()
         resting = {i for i, state in at.items() if state == 0 or stopped[i] == 0.0}
         for i in range(n):
@@ -154,7 +155,7 @@ class Stops:
         if begun:
             a[:] = (W @ [-self._friction[i] * begun.get(i, 0) for i in range(n)] + a).tolist()
         self.held = [i for i, rest in enumerate(self.rest) if rest]
-        self.watched = [i for i in self.held if i not in locked]
+        self.watched = [i for i in self.held if not kept[i] and not (self._has_no_range(i) and self._stays(i))]
         return self.restrain(y, a)
 
     def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:
@@ -192,10 +193,15 @@ class Stops:
 
     def _grips(self, i: int, q: float, effort: float) -> tuple[float, float]:
         friction = 0.0 if self.rest[i] == CLAMPED else self._friction[i]
-        above, low, high = q >= self.limits[i][1], friction + effort, friction - effort
+        above = self.slip[i] > 0 if self._has_no_range(i) else q >= self.limits[i][1]
+        low, high = friction + effort, friction - effort
         if self.rest[i] == STUCK:
             return low, high
         return (inf, high) if above else (low, inf)
+
+    def _stays(self, i: int) -> bool:
+        """Return whether no change of the efforts changes how a held joint without a range acts on the others."""
+        return self.rigid or (self.rest[i] == CLAMPED and not self.slip[i])
 
     def _has_no_range(self, i: int) -> bool:
         low, high = self.limits[i]
