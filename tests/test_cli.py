@@ -307,6 +307,8 @@ def test_one_value_for_a_vector_says_that_it_was_spread(native_path, tmp_path, c
 def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_path, tmp_path):
     answer, urdf = tmp_path / "answer", Path(__file__).parents[1] / "urdf/2dof.urdf"
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.02)
+    hostile = tmp_path / "hostile.urdf"
+    hostile.write_text(urdf.read_text().replace('"joint1"', '"joint\u202e1"').replace('"link1"', '"link\x9b1"'))
     for line, expected in {
         "twodof pu": ["publish"],
         "twodof run --stor": ["--storage"],
@@ -316,6 +318,8 @@ def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_pa
         f"twodof sweep {native_path} --grid Kp": ["Kp="],
         f"twodof build {urdf} --frame En": ["EndEffector"],
         f"twodof build {urdf} --lock jo": ["joint1", "joint2"],
+        f"twodof build {hostile} --lock jo": ["joint2"],
+        f"twodof build {hostile} --frame li": ["link2"],
         f"twodof plot {tmp_path / 'bag'} --joints jo": ["joint1", "joint2"],
         f"twodof plot {tmp_path / 'bag'} --frame li": ["link1", "link2"],
     }.items():

@@ -102,7 +102,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
 
-        argcomplete.autocomplete(program)
+        argcomplete.autocomplete(program, validator=lambda word, begun: word.startswith(begun) and word.isprintable())
     for argument in takewhile("--".__ne__, arguments):  # argparse would read it as an empty list
         if re.fullmatch(r"(-\w|--[\w-]+=)--", argument):
             program.error(f"argument {argument[:-2].rstrip('=')}: '--' is not a value")
