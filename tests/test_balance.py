@@ -18,7 +18,8 @@ from twodof.plant.mechanism import Mechanism
 from twodof.plant.robot import load_robot
 from twodof.plant.urdf import read_urdf
 from twodof.simulation.balance import UNKNOWN, parts_of_error
-from twodof.simulation.setup import setup
+from twodof.simulation.judge import Judge
+from twodof.simulation.setup import robot_of, setup, setup_of
 from twodof.simulation.verdict import judged
 
 AWAY: dict[str, Any] = {"q_des": (0.9, 0.8)}
@@ -135,6 +136,17 @@ def test_friction_that_holds_two_joints_is_first_beside_a_load_that_it_balances(
     made = verdict("joint", **AWAY, friction=(0.1, 0.05), tau_ext=(0.1, 0.0))
     assert [cause.kind for cause in made.causes] == ["friction"] * len(made.causes)
     assert verdict("joint", **AWAY, friction=(0.1, 0.0), tau_ext=(0.1, 0.0)).numbers["final_joint_error"] < 0.2
+
+
+@pytest.mark.parametrize("more", [{"Kp[3]": 1.0}, {"Kd[2]": None}, {"xdd_des[2]": None}])
+def test_gains_that_are_not_those_of_the_error_have_no_balance(more: dict[str, float | None]) -> None:
+    """A forged or third-party bag may have any number of them."""
+    run = twodof.experiment(fmu_of("arm", "task"), settings={"payload": 0.3}, stop_time=0.1)
+    made = setup_of(run.fmu, robot_of(run.fmu.urdf), run.step, run.start_values)
+    starts = {name: value for name, value in {**made.starts, **more}.items() if value is not None}
+    judge = Judge(made._replace(starts=starts), [2, 2, 2, 2, 0])
+    judge.judge(np.arange(2) * run.step, np.full((2, 8), 0.1), judge.targets)
+    assert parts_of_error(judge, ["x"]) == UNKNOWN
 
 
 def test_a_distance_that_overflows_is_not_reached() -> None:

@@ -174,7 +174,7 @@ def test_a_verdict_is_strict_json_if_a_repetition_diverges(fmus: dict[str, Path]
 
 def test_causes_that_keep_the_error_only_together_are_all_named(fmus: dict[str, Path]) -> None:
     """Without one of them the error is as large: friction holds one joint, and a torque would move the other."""
-    both = {"q_des": (0.9, 0.8), "friction": (0.1, 0.05), "tau_ext": (0.1, 0.0)}
+    both: dict[str, Any] = {"q_des": (0.9, 0.8), "friction": (0.1, 0.05), "tau_ext": (0.1, 0.0)}
     still, smooth, without = (
         error(twodof.simulate(fmus["joint"], settings=both | one))
         for one in ({"tau_ext": 0.0}, {"friction": 0.0}, {"tau_ext": 0.0, "friction": 0.0})

@@ -65,7 +65,8 @@ def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
     if not missed or setup.robot is None or not efforts or len(gravity) != 3:
         return UNKNOWN
     known = setup.frame in setup.robot.links and {*setup.joints} <= setup.robot.joints.keys()
-    if not known or any(not len(judge.given(LAWS[name][0])) for name in judge.aims):
+    sizes = {"x": len(setup.rows), "quat": 3, "q": len(setup.joints)}
+    if not known or any(len(judge.given(group)) != sizes[name] for name in judge.aims for group in LAWS[name]):
         return UNKNOWN
     models = _models(judge)
     owner = [name for name in judge.aims for _ in judge.given(LAWS[name][0])]

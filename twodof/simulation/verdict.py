@@ -102,7 +102,7 @@ SHAPE = {
             "noted": bool,
             "subject": str,
             "part": NUMBER | None,
-            "tried": str,
+            "tried": str | None,
             "removes": NUMBER | None,
         }
     ],

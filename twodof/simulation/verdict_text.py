@@ -7,7 +7,7 @@ import numpy as np
 
 from .aim import SMALLEST_MOVE
 from .cause import FLOOR, SMALL, Cause, point_text
-from .controller_causes import STILL, controller_prefix
+from .controller_causes import STILL, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
 
 WHOLE = 0.995  # part of an error that is printed as the whole
@@ -89,7 +89,8 @@ def _settings(judge: Judge) -> str:
     """Return the settings of the controller that are not 0 in words."""
     texts = []
     own = controller_prefix(judge)
-    believed = {f"{own}payload": " kg"} if own else {}
+    real, model = payloads(judge)
+    believed = {f"{own}payload": " kg"} if model not in (0.0, real) else {}
     for name, unit in {**CONTROLLER, **believed, **dict.fromkeys(SWITCHES, "")}.items():
         values = judge.given(name) if f"{name}[1]" in judge.held else np.array([float(judge.held.get(name, 0.0))])
         if values.any():
