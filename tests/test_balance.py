@@ -145,7 +145,7 @@ def test_gains_that_are_not_those_of_the_error_have_no_balance(more: dict[str, f
     made = setup_of(run.fmu, robot_of(run.fmu.urdf), run.step, run.start_values)
     starts = {name: value for name, value in {**made.starts, **more}.items() if value is not None}
     judge = Judge(made._replace(starts=starts), [2, 2, 2, 2, 0])
-    judge.judge(np.arange(2) * run.step, np.full((2, 8), 0.1), judge.targets)
+    judge.judge(np.array([0.0, run.step]), np.full((2, 8), 0.1), judge.targets)
     assert parts_of_error(judge, ["x"]) == UNKNOWN
 
 

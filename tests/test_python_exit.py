@@ -98,7 +98,7 @@ def test_an_fmu_of_pythonfmus_own_is_repaired_where_it_is_loaded(fmu_path, tmp_p
             copy.writestr(name, original() if name == LIBRARY else archive.read(name))
     monkeypatch.setattr(
         "twodof.fmu.instance.Instance.__init__",
-        lambda self, fmu, folder: loaded.append((folder / LIBRARY).read_bytes()),
+        lambda self, fmu, folder, *_: loaded.append((folder / LIBRARY).read_bytes()),
     )
     monkeypatch.setattr("twodof.fmu.instance.Instance.free", lambda self: None)
     with twodof.fmu.instantiate(twodof.load_fmu(other)):
