@@ -15,6 +15,7 @@ from native_models import robots_folder
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import SimulationError
 
 CIRCLE = 0.06  # m
 
@@ -268,3 +269,14 @@ def test_a_bag_has_the_errors_without_the_causes(
     line = "(if it is known: 0.000224 m); set payload_known=true"
     assert line in printed and line in capsys.readouterr().out
     assert twodof.verdict(bag).causes[0].removes == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_instance_that_cannot_be_reset_leaves_the_causes_as_they_are(
+    fmus: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: object) -> None:
+        raise SimulationError("fatal")
+
+    summary = twodof.simulate(fmus["task"], settings={"payload": 0.3})
+    monkeypatch.setattr("twodof.fmu.instance.Instance.reset", refuse)
+    assert [(cause.kind, cause.tried) for cause in summary.verdict.causes] == [("load", "")]

@@ -12,6 +12,7 @@ from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
 from .controller_causes import GAINS, controller_prefix, damping, feedforward, load, payloads
 from .judge import OF_THE_END, Judge
 from .setup import OF_THE_CONTROLLER
+from .verdict_text import worst_joint
 
 LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
 LONGER = 10.0  # a run is repeated for at most this many times its duration more
@@ -176,11 +177,8 @@ def _errors(result: Judge, missed: Sequence[str]) -> str:
     """Return the errors of the missed outputs at the end in words."""
     texts = []
     for name in missed:
-        size, unit = result.aims[name].last, "m" if name == "x" else "rad"
-        if name == "q":
-            off = np.abs(result.wanted(name) - result.end(name))
-            size, unit = float(off.max()), result.setup.units[int(off.argmax())]
-        texts.append(f"{size:.3g} {unit}".strip())
+        unit = "m" if name == "x" else "rad"
+        texts.append(worst_joint(result)[0] if name == "q" else f"{result.aims[name].last:.3g} {unit}")
     return " and ".join(texts)
 
 

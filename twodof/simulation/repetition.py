@@ -43,7 +43,7 @@ def repeated(run: Experiment, plans: Sequence[Repetition]) -> list[Judge | None]
     try:
         with instantiate(run.fmu) as instance, _without_messages():
             judges = [_judged(_changed(run, plan), instance, lambda: time.monotonic() > end) for plan in plans]
-    except FmuError:  # the file was replaced meanwhile
+    except (FmuError, SimulationError):  # the file was replaced meanwhile, or an instance cannot be reset
         return [None] * len(plans)
     return judges if time.monotonic() <= end else [None] * len(plans)
 

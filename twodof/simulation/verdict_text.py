@@ -101,18 +101,23 @@ def _settings(judge: Judge) -> str:
 
 def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
     """Return the errors at the end in words."""
-    texts, setup = [], judge.setup
+    texts = []
     if "final_error" in numbers:
         target = point_text(judge.wanted("x"))
         texts.append(f"{numbers['final_error']:.3g} m from the target {target} m")
     if "final_turn_error" in numbers:
         texts.append(f"{numbers['final_turn_error']:.3g} rad from the target orientation")
     if "final_joint_error" in numbers:
-        off = np.abs(judge.wanted("q") - judge.end("q"))
-        worst = int(off.argmax())
-        far = f"{off[worst]:.3g} {setup.units[worst]}".strip()
-        texts.append(f"joint errors of up to {far} ('{setup.joints[worst]}')")
+        far, joint = worst_joint(judge)
+        texts.append(f"joint errors of up to {far} ('{joint}')")
     return texts
+
+
+def worst_joint(judge: Judge) -> tuple[str, str]:
+    """Return the largest error of a joint at the end, with its unit, and the joint."""
+    off = np.abs(judge.wanted("q") - judge.end("q"))
+    worst = int(off.argmax())
+    return f"{off[worst]:.3g} {judge.setup.units[worst]}".strip(), judge.setup.joints[worst]
 
 
 def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...]) -> str:
