@@ -156,7 +156,7 @@ def _is_noted(cause: Cause, tried: Sequence[Cause], most: float) -> bool:
         return True
     kinds = {other.kind for other in tried}
     led = cause.kind in FOLLOWING or (cause.kind == "reach" and "degrees" in kinds)
-    beyond = cause.kind == "limit" and any(c.kind == "reach" and c.joint == cause.joint for c in tried)
+    beyond = cause.kind == "limit" and any(c.kind in ("reach", "degrees") and c.joint == cause.joint for c in tried)
     return beyond or (led and most > WHOLE and cause.removes != most) or (cause.noted and cause.removes is None)
 
 
