@@ -16,6 +16,8 @@ from native_models import robots_folder
 import twodof
 from twodof.cli.main import main
 from twodof.errors import SimulationError
+from twodof.simulation.remedies import Repetition
+from twodof.simulation.repetition import Repeater
 
 CIRCLE = 0.06  # m
 
@@ -282,3 +284,75 @@ def test_an_instance_that_cannot_be_reset_leaves_the_causes_as_they_are(
     summary = twodof.simulate(fmus["task"], settings={"payload": 0.3})
     monkeypatch.setattr("twodof.fmu.instance.Instance.reset", refuse)
     assert [(cause.kind, cause.tried) for cause in summary.verdict.causes] == [("load", "")]
+
+
+def test_a_number_of_a_joint_that_the_largest_error_hides_is_named(fmus: dict[str, Path]) -> None:
+    settings = {"q_des": (0.9, 0.8), "Kd": (0.1, 40.0), "friction": (0.0, 0.05)}
+    lines = twodof.simulate(fmus["joint"], settings=settings).verdict.lines
+    cured = twodof.simulate(fmus["joint"], settings={**settings, "Kd": (2.0 * 50.0**0.5, 40.0)})
+    first, second = (abs(wanted - q) for wanted, q in zip((0.9, 0.8), cured.last.q))
+    texts = re.findall(
+        r"with critical damping: ([\d.e-]+) rad of joint 'joint2', ([\d.e-]+) rad of joint 'joint1'", lines[1]
+    )
+    assert [*map(float, texts[0])] == pytest.approx([second, first], rel=6e-3), lines
+
+
+@pytest.mark.parametrize(
+    ("settings", "without"),
+    [
+        # the joint that the payload does not move is held by friction; without friction the payload moves it further
+        ({"q_des": (0.9, 0.8), "friction": (0.1, 0.05), "payload": 0.05}, {"payload_known": True, "friction": 0.0}),
+        ({"q_des": (0.9, 0.8), "friction": (0.1, 0.05), "payload": 0.1}, {"payload_known": True, "friction": 0.0}),
+    ],
+)
+def test_a_cause_that_acts_without_the_first_one_is_no_note(fmus: dict[str, Path], settings, without) -> None:
+    lines = twodof.simulate(fmus["joint"], settings=settings).verdict.lines
+    cured = twodof.simulate(fmus["joint"], settings={**settings, **without})
+    assert "payload" in lines[0] and lines[1].startswith("also joint"), lines
+    assert float(re.findall(r"without both: ([\d.e-]+) rad", lines[1])[0]) == pytest.approx(error(cured), rel=6e-3)
+
+
+def test_slow_gains_are_a_cause_if_no_other_removal_helps(fmus: dict[str, Path]) -> None:
+    model = {"controller.payload": 0.00672, "controller.payload_known": True}
+    slow = {**model, "xdd_des": (0.99, -0.729), "Kp": 1.06, "Kd": 20.0}
+    first = twodof.simulate(fmus["system"], settings=slow).verdict.causes[0]
+    cured = twodof.simulate(fmus["system"], settings={**slow, "Kp": 50.0, "Kd": 40.0})
+    assert first.text.startswith("the gains are Kp = 1.06 and Kd = 20")
+    assert float(re.findall(r"([\d.e-]+) m$", first.tried)[0]) == pytest.approx(error(cured), rel=6e-3)
+
+
+@pytest.mark.parametrize(
+    ("fmu", "settings", "helps"),
+    [
+        ("task", {"friction": 0.1}, True),
+        ("joint", {"q_des": (0.9, 0.8), "tau_ext": (0.3, 0.0)}, True),
+        ("task", {"friction": 0.1, "q_min": (-0.2, -3.0)}, False),  # a joint stands at its limit, at any gain
+        ("joint", {"q_des": (0.9, 0.8), "friction": 0.1, "control_period": 0.05, "Kp": 100.0}, False),  # unstable
+    ],
+)
+def test_the_advice_to_raise_a_gain_is_tried(fmus: dict[str, Path], fmu, settings, helps) -> None:
+    first = twodof.simulate(fmus[fmu], settings=settings).verdict.lines[0]
+    gains = {"Kp": 10.0 * settings.get("Kp", 50.0), "Kd": 10.0**0.5 * 40.0}
+    stiffer = twodof.simulate(fmus[fmu], settings={**settings, **gains})
+    advice = re.findall(r"raise Kp \(with Kp = (\d+) and Kd = 126.5: ([\d.e-]+) (?:m|rad)\)", first)
+    assert ("raise Kp" in first) == helps, first
+    if helps:
+        assert [*map(float, advice[0])] == [gains["Kp"], pytest.approx(error(stiffer), rel=6e-3)]
+
+
+def test_a_request_to_stop_ends_the_repetitions(fmus: dict[str, Path]) -> None:
+    summary = twodof.simulate(fmus["task"], settings={"payload": 0.3})
+    repeater = summary.repeat
+    assert isinstance(repeater, Repeater) and not repeater.stop()
+    plan = Repetition("", (("payload", 0.0),))
+    assert repeater([plan])[0] is not None
+    assert Repeater(repeater.run, lambda: True)([plan]) == [None]
+
+
+def test_all_repetitions_of_a_run_share_their_time(fmus: dict[str, Path]) -> None:
+    run = twodof.simulate(fmus["task"], settings={"payload": 0.3}).repeat.run  # type: ignore[union-attr]
+    repeater, plan = Repeater(run, lambda: False), Repetition("", (("payload", 0.0),))
+    before = repeater.left
+    assert repeater([plan])[0] is not None and repeater.left < before
+    repeater.left = 0.0
+    assert repeater([plan, plan]) == [None, None]

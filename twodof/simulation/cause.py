@@ -10,7 +10,7 @@ KINDS = {
     "diverged": "a value that is not finite",
     "degrees": "a value in degrees instead of radians",
     "reach": "the target is out of reach",
-    "gain": "a gain of 0",
+    "gain": "a gain of 0, or gains far from the usual ones",
     "feedforward": "a target that rests, with a target velocity or acceleration",
     "unstable": "a sampled loop that is unstable or close to it",
     "sampling": "an oscillation as fast as the steps of controller or communication",

@@ -19,7 +19,7 @@ from .input_values import Setting
 from .pace import RealTime
 from .progress import Progress
 from .removal import Repeat
-from .repetition import is_repeatable, repeated
+from .repetition import Repeater, is_repeatable
 from .run_summary import Summary
 from .sample import Sample, Sink
 from .setup import robot_of
@@ -84,11 +84,11 @@ class Member(NamedTuple):
 
         return steer if commands else self.steer
 
-    def repeat(self, last: Sample) -> Repeat | None:
-        """Return a function that repeats the run after its last sample; None for one that cannot be repeated."""
+    def repeat(self, last: Sample, stop: Stop) -> Repeat | None:
+        """Return a function that repeats the run until ``stop``; None for one that cannot be repeated."""
         steered = self.steer is not ignore or any(type(sink).command is not Sink.command for sink in self.sinks)
         whole = last.k == self.run.steps and self.instance is None and not steered
-        return partial(repeated, self.run) if whole and is_repeatable(self.run) else None
+        return Repeater(self.run, stop) if whole and is_repeatable(self.run) else None
 
     def resumed(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
         """Return the first start values from ``resume`` or a sink with which to continue after a discarded step."""
@@ -144,7 +144,7 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
                 break
         taken = time.perf_counter() - started
         summaries = [
-            Summary(s, taken, s.k < member.run.steps, j, member.repeat(s))
+            Summary(s, taken, s.k < member.run.steps, j, member.repeat(s, stop))
             for s, member, j in zip(latest, members, judges)
         ]
         for summary, (_, sinks, *_) in zip(summaries, members):

@@ -1,39 +1,20 @@
 """Order of the causes of a failed run, by the errors of repeated runs without each of them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from math import inf, isfinite, radians, sqrt
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from math import inf, isfinite
 
 import numpy as np
 
-from ..plant.urdf import UNBOUNDED
-from ..plant.variables import ROWS
 from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
-from .controller_causes import GAINS, controller_prefix, damping, feedforward, load, payloads
+from .controller_causes import GAINS, damping, feedforward, load
 from .judge import OF_THE_END, Judge
-from .setup import OF_THE_CONTROLLER
-from .verdict_text import worst_joint
+from .remedies import SAMPLING, Repetition, named, stiffer, without
+from .verdict_text import unit_of_error, worst_joint
 
 LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
-LONGER = 10.0  # a run is repeated for at most this many times its duration more
 HALF = 0.5  # part of the error; if no cause removes as much, all other settings are tried
 WHOLE = 0.9  # part of the error whose removal explains all consequences
-TURN = 6.0  # rad: larger joint targets are in degrees, if one is
-SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
-
-
-class Repetition(NamedTuple):
-    """A repetition of a run with other settings.
-
-    Attributes:
-        words: the difference in words.
-        settings: names and values of inputs and parameters, held during the whole run.
-        longer: additional duration, s.
-    """
-
-    words: str
-    settings: tuple[tuple[str, float], ...] = ()
-    longer: float = 0.0
+ADVICE = "; raise Kp"
 
 
 Repeat = Callable[[Sequence[Repetition]], Sequence[Judge | None]]
@@ -63,6 +44,8 @@ def by_removal(
     if _most(tried) < HALF:
         others = trials.tried(_others(judge, missed, why))
         tried += [cause for cause in others if (cause.removes or 0.0) >= LITTLE]
+    if max(_most(tried), trials.without_all(tried)) < LITTLE:
+        tried += [cause for cause in trials.tried([*_gains(judge)]) if (cause.removes or 0.0) >= LITTLE]
     most = _most(tried)
     if most >= LITTLE or any(map(_is_open, tried)):
         counted = [
@@ -74,13 +57,16 @@ def by_removal(
     elif both := next((some for some in (tried, tried + others) if trials.without_all(some) >= LITTLE), None):
         tried = [cause._replace(noted=cause.noted and not cause.tried) for cause in both]  # only together they keep it
         tried.sort(key=lambda cause: _rank(cause, 0.0))
-    root = trials.without(tried[0]) if tried else None
+    root = trials.result(tried[0]) if tried else None
     if root is None:
         return tuple(tried)
-    known = {(cause.kind, cause.joint, cause.subject) for cause in tried}
-    rest = [c for c in causes_of(root) if not c.noted and (c.kind, c.joint, c.subject) not in known]
+    left = {(c.kind, c.joint, c.subject): c for c in causes_of(root) if not c.noted}
+    known = [(cause.kind, cause.joint, cause.subject) for cause in tried]
+    tried = [c._replace(noted=c.noted and key not in left) for c, key in zip(tried, known)]  # it acts without the first
+    rest = [cause for key, cause in left.items() if key not in known]
     rest = [cause._replace(text=f"without the first cause: {cause.text}", part=None) for cause in rest[:1]]
-    return *trials.together(tried), *rest
+    first, *others = trials.together(tried)
+    return trials.advised(first), *others, *rest
 
 
 class _Trials:
@@ -93,7 +79,7 @@ class _Trials:
 
     def tried(self, causes: Sequence[Cause]) -> list[Cause]:
         """Return causes with the results of the runs without them, as far as there are some."""
-        plans = {cause.text: plan for cause in causes if (plan := _without(self._judge, cause)) is not None}
+        plans = {cause.text: plan for cause in causes if (plan := without(self._judge, cause)) is not None}
         new = [plan for plan in dict.fromkeys(plans.values()) if plan not in self._results]
         self._plans |= plans
         for plan, result in zip(new, self._repeat(new)):
@@ -102,12 +88,12 @@ class _Trials:
         return [self._with_result(cause) for cause in causes]
 
     def _with_result(self, cause: Cause) -> Cause:
-        if (result := self.without(cause)) is None:
+        if (result := self.result(cause)) is None:
             return cause
-        tried = f"{self._plans[cause.text].words}: {_errors(result, self._missed)}"
+        tried = f"{self._plans[cause.text].words}: {self._errors(result)}"
         return cause._replace(tried=tried, removes=1.0 - self._size(result) / self._size(self._judge))
 
-    def without(self, cause: Cause) -> Judge | None:
+    def result(self, cause: Cause) -> Judge | None:
         """Return the judge of the run without a cause; None if there is none."""
         plan = self._plans.get(cause.text)
         return None if plan is None else self._results.get(plan)
@@ -132,17 +118,48 @@ class _Trials:
         each = [*dict.fromkeys(self._plans[cause.text] for cause in tried if cause.tried and not cause.noted)]
         if (result := self._without(each)) is None:
             return tried
-        words = f"; without {'both' if len(each) == 2 else 'all'}: {_errors(result, self._missed)}"
+        words = f"; without {'both' if len(each) == 2 else 'all'}: {self._errors(result)}"
         last = [cause.tried != "" and self._plans[cause.text] == each[-1] for cause in tried]
         return [cause._replace(tried=cause.tried + words) if own else cause for cause, own in zip(tried, last)]
 
+    def advised(self, cause: Cause) -> Cause:
+        """Return a cause with the errors of a run with its advice to raise Kp; without the advice, if it is wrong."""
+        if ADVICE not in cause.text or (result := self._repeat([plan := stiffer(self._judge)])[0]) is None:
+            return cause
+        helps = self._size(result) < HALF * self._size(self._judge)
+        advice = f"{ADVICE} ({plan.words}: {self._errors(result)})" if helps else ""
+        return cause._replace(text=cause.text.replace(ADVICE, advice))
+
     def _size(self, result: Judge) -> float:
         """Return the sum of the RMS errors at the end of a run, relative to the largest errors of the first one."""
-        late = result.history() >= result.changed + (1.0 - OF_THE_END) * (result.duration - result.changed)
-        with np.errstate(over="ignore", invalid="ignore"):  # a repetition may diverge
-            rms = {name: float(np.sqrt(np.mean(result.error_history(name)[late] ** 2))) for name in self._missed}
         largest = {name: max(float(self._judge.error_history(name).max()), FLOOR) for name in self._missed}
-        return sum(rms[name] / largest[name] for name in self._missed)
+        return sum(_rms(result, name) / largest[name] for name in self._missed)
+
+    def _errors(self, result: Judge) -> str:
+        """Return the errors of the missed outputs at the end of a repeated run in words."""
+        return " and ".join(self._error(result, name) for name in self._missed)
+
+    def _error(self, result: Judge, name: str) -> str:
+        """Return an error in words: at the end, or else its RMS, if only that is smaller or larger than in the run."""
+        runs, unit = (result, self._judge), unit_of_error(result, name)
+        (last, before), (rms, rms_before) = [run.aims[name].last for run in runs], [_rms(run, name) for run in runs]
+        if (last < before) != (rms < rms_before):
+            return f"RMS error {rms:.3g} {unit} instead of {rms_before:.3g} {unit}"
+        if name != "q":
+            return f"{last:.3g} {unit}"
+        errors, before_each = (np.abs(run.wanted("q") - run.end("q")) for run in runs)
+        most, i = worst_joint(result)[0], int((before_each - errors).argmax())
+        if errors.max() <= (1.0 - LITTLE) * before_each.max() or i == errors.argmax():
+            return most
+        joints, units = result.setup.joints, result.setup.units
+        return f"{most} of joint '{joints[int(errors.argmax())]}', {errors[i]:.3g} {units[i]} of joint '{joints[i]}'"
+
+
+def _rms(judge: Judge, name: str) -> float:
+    """Return the RMS error of an output at the end of a run, m or rad."""
+    late = judge.history() >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)
+    with np.errstate(over="ignore", invalid="ignore"):  # a repetition may diverge
+        return float(np.sqrt(np.mean(judge.error_history(name)[late] ** 2)))
 
 
 def _most(tried: Sequence[Cause]) -> float:
@@ -173,15 +190,6 @@ def _rank(cause: Cause, left: float) -> float:
     return -round(untried if cause.removes is None else cause.removes, 1)
 
 
-def _errors(result: Judge, missed: Sequence[str]) -> str:
-    """Return the errors of the missed outputs at the end in words."""
-    texts = []
-    for name in missed:
-        unit = "m" if name == "x" else "rad"
-        texts.append(worst_joint(result)[0] if name == "q" else f"{result.aims[name].last:.3g} {unit}")
-    return " and ".join(texts)
-
-
 def _others(judge: Judge, missed: Sequence[str], why: Sequence[Cause]) -> list[Cause]:
     """Return settings as causes that the balance of forces at the end does not show, beside those known."""
     known = {(cause.kind, cause.subject) for cause in why}
@@ -208,94 +216,8 @@ def _sampling(judge: Judge) -> Iterator[Cause]:
         yield Cause("sampling", f"the controller acts with {', '.join(named)}")
 
 
-def _without(judge: Judge, cause: Cause) -> Repetition | None:
-    """Return the repetition of a run without one of its causes; None if the cause is not one of the settings."""
-    held, own = judge.held, controller_prefix(judge)
-
-    def plan(words: str, settings: Mapping[str, float]) -> Repetition | None:
-        starts, inputs = judge.setup.starts, judge.inputs
-        changes = [name in inputs or starts.get(name, value) != value for name, value in settings.items()]
-        return Repetition(words, tuple(settings.items())) if any(changes) else None
-
-    match cause.kind:
-        case "friction":
-            return plan("without friction", _elements(held, "friction", 0.0))
-        case "feedforward" | "drag":
-            return plan("without it", _elements(held, cause.subject, 0.0))
-        case "load":
-            return plan(*_known_load(judge, cause.subject))
-        case "saturation":
-            return plan("without this limit", {"limit_effort": False})
-        case "limit":
-            wide = _elements(held, "q_min", -UNBOUNDED) | _elements(held, "q_max", UNBOUNDED)
-            return plan("without limits of the joints", wide)
-        case "unstable" | "sampling" if not own:
-            exact = {name: type(value)(0) for name, value in held.items() if name.partition("[")[0] in SAMPLING}
-            return plan("with a continuous controller and exact sensors", exact)
-        case "gain":
-            raised = _raised(judge)
-            gains = dict.fromkeys(f"{name.partition('[')[0]} = {value:g}" for name, value in raised.items())
-            return plan(f"with {' and '.join(gains)}", raised)
-        case "damping":
-            return plan("with critical damping", _critical(judge))
-        case "degrees":
-            return plan("read as degrees", _in_radians(judge, cause.joint))
-        case "reach" if not judge.wanted("quat").size and judge.changed <= 0.0:
-            return plan("with a target in reach", _in_reach(judge, cause))
-        case "time" if not judge.moving and cause.share <= LONGER * judge.duration:
-            return Repetition(f"after {judge.duration + cause.share:.4g} s", longer=cause.share)
-    return None
-
-
-def _elements(held: Mapping[str, float], group: str, value: float) -> dict[str, float]:
-    """Return a value for all elements of a vector."""
-    return {name: value for name in held if name.partition("[")[0] == group}
-
-
-def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
-    """Return settings with which the controller knows a load, or without an external load, in words first."""
-    own, held = controller_prefix(judge), judge.held
-    if subject == "payload":
-        payload, _ = payloads(judge)
-        known = {f"{own}payload_known": True, f"{own}payload": payload}
-        return ("if it is known", known) if payload or not own else ("without it", {f"{own}payload": 0.0})
-    if own and f"{own}{subject}[1]" in held:
-        model = [name for name in held if name.partition("[")[0] == subject]
-        return "with that of the plant", {f"{own}{name}": held[name] for name in model}
-    return "without it", _elements(held, subject, 0.0)
-
-
-def _in_radians(judge: Judge, joint: str) -> dict[str, float]:
-    """Return large positions of a joint, read as degrees, in rad."""
-    i = judge.setup.joints.index(joint)
-    values = {f"{group}[{i + 1}]": judge.held.get(f"{group}[{i + 1}]", 0.0) for group in ("q_des", "q_start")}
-    return {name: radians(value) for name, value in values.items() if abs(value) > TURN}
-
-
-def _raised(judge: Judge) -> dict[str, float]:
-    """Return the largest gain of its group, or else the usual one, for each proportional gain of 0."""
-    usual = {name: start for name, *_, start, _ in ROWS if isinstance(start, float)}
-    raised = dict[str, float]()
-    for stiff, _ in GAINS:
-        values = judge.given(stiff)
-        most = float(max(values, default=0.0)) or usual[stiff]
-        raised |= {f"{stiff}[{i + 1}]": most for i, value in enumerate(values) if value == 0.0}
-    return raised
-
-
-def _critical(judge: Judge) -> dict[str, float]:
-    """Return damping gains that are at least critical."""
-    return {
-        f"{damp}[{i + 1}]": max(d, 2.0 * sqrt(p))
-        for stiff, damp in GAINS
-        for i, (p, d) in enumerate(zip(judge.given(stiff), judge.given(damp)))
-    }
-
-
-def _in_reach(judge: Judge, cause: Cause) -> dict[str, float]:
-    """Return the nearest target that the robot can reach."""
-    setup = judge.setup
-    if cause.point:
-        return {f"x_des[{i + 1}]": cause.point[row] for i, row in enumerate(setup.rows)}
-    i = setup.joints.index(cause.joint)
-    return {f"q_des[{i + 1}]": float(np.clip(judge.wanted("q")[i], setup.low[i], setup.high[i]))}
+def _gains(judge: Judge) -> Iterator[Cause]:
+    """Yield gains that differ from the usual ones as a cause."""
+    values = {group: judge.given(group) for pair in GAINS for group in pair if judge.given(group).size}
+    if values:
+        yield Cause("gain", f"the gains are {named(values)}", subject="usual")

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import ceil
 
 from ..errors import FmuError, SimulationError
@@ -15,12 +15,12 @@ from ..fmu.instance import logger
 from ..signatures import ignore
 from .experiments import Experiment
 from .judge import Judge
-from .removal import Repetition
+from .remedies import Repetition
 from .setup import robot_of
 from .stepping import Stop, judge_of, stepped
 
 MOST_STEPS = 5000  # communication steps of a run that is repeated
-PATIENCE = 5.0  # s of wall time; if repetitions need more, all are left out
+PATIENCE = 5.0  # s of wall time of all repetitions of a run
 
 
 def is_repeatable(run: Experiment) -> bool:
@@ -34,18 +34,38 @@ def _is_native(fmu: Fmu) -> bool:
     return own and not fmu.description.coSimulation.needsExecutionTool
 
 
-def repeated(run: Experiment, plans: Sequence[Repetition]) -> list[Judge | None]:
-    """Run an experiment again for each plan; return the judges, None for a run that failed.
+@dataclass
+class Repeater:
+    """Repeats an experiment with other settings.
 
-    All are None if they take longer than PATIENCE: causes with results and others are not comparable.
+    Attributes:
+        run: the experiment.
+        stop: called between steps; True ends the repetitions.
+        left: wall time that they may still take, s.
     """
-    end = time.monotonic() + PATIENCE
-    try:
-        with instantiate(run.fmu) as instance, _without_messages():
-            judges = [_judged(_changed(run, plan), instance, lambda: time.monotonic() > end) for plan in plans]
-    except (FmuError, SimulationError):  # the file was replaced meanwhile, or an instance cannot be reset
-        return [None] * len(plans)
-    return judges if time.monotonic() <= end else [None] * len(plans)
+
+    run: Experiment
+    stop: Stop
+    left: float = PATIENCE
+
+    def __call__(self, plans: Sequence[Repetition]) -> list[Judge | None]:
+        """Run the experiment again for each plan; return the judges, None for a run that failed.
+
+        All are None if no time is left or ``stop`` returns true: causes with results and others are not comparable.
+        """
+        end = time.monotonic() + self.left
+
+        def late() -> bool:
+            return time.monotonic() > end or self.stop()
+
+        try:
+            with instantiate(self.run.fmu) as instance, _without_messages():
+                judges = [_judged(_changed(self.run, plan), instance, late) for plan in plans]
+        except (FmuError, SimulationError):  # the file was replaced meanwhile, or an instance cannot be reset
+            return [None] * len(plans)
+        whole = not late()
+        self.left = end - time.monotonic()
+        return judges if whole else [None] * len(plans)
 
 
 def _changed(run: Experiment, plan: Repetition) -> Experiment:

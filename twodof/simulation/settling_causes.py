@@ -81,9 +81,9 @@ def unsettled(judge: Judge, moving: float, static: Mapping[str, float]) -> Itera
     settings = " and ".join(f"{name} = {judge.setup.starts[name]:g} s" for name in PERIODS if judge.held.get(name))
     if left > 0.0 and moving > 0.5:
         rests = any(rest > max(BAND * judge.aims[name].first, FLOOR) for name, rest in static.items())
-        text = "the motion has not settled"
-        text += "; raise the gains" if rests else f": with these gains it takes about {left:.3g} s more to 2 %"
-        yield Cause("time", text + ("" if rests else "; raise the gains, or stop later"), left)
+        text = f": with these gains it takes about {left:.3g} s more to 2 %; raise the gains, or stop later"
+        text = ", and other causes keep an error; stop later to see them" if rests else text
+        yield Cause("time", f"the motion has not settled{text}", left)
     elif sensors:
         text = f"joint '{judge.setup.joints[i]}' is measured with {sensors}"
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) if judge.wanted("q").size else inf
@@ -115,4 +115,4 @@ def late_change(judge: Judge) -> Iterator[Cause]:
         name, (before, after) = max(changes.items(), key=lambda change: abs(change[1][1] - change[1][0]))
         text = f"{name} changed from {before:.4g} to {after:.4g} at {t:.4g} s"
         text += f", and an error needs about {needed:.3g} s to decay to 2 %"
-        yield Cause("time", f"{text}; stop later", judge.duration)
+        yield Cause("time", f"{text}; stop later", needed)

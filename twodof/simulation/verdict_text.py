@@ -125,7 +125,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
         moves = {name: aim for name, aim in judge.aims.items() if aim.first >= FLOOR} or judge.aims
-        firsts = [f"{aim.first:.3g} {_unit(judge, name)}" for name, aim in moves.items()]
+        firsts = [f"{aim.first:.3g} {unit_of_error(judge, name)}" for name, aim in moves.items()]
         late = f"not within 2 % of the initial error of {' and '.join(firsts)}"
         late += ", farther from the target than at the start" * any(aim.last > aim.first for aim in moves.values())
         moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
@@ -135,7 +135,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         if "overshoot" in numbers and (numbers["overshoot"] or outcome == "reached"):
             past = numbers["overshoot"]
             name, aim = next(iter(judge.aims.items()))
-            far = f"the target is passed by {past * aim.first:.3g} {_unit(judge, name)}"
+            far = f"the target is passed by {past * aim.first:.3g} {unit_of_error(judge, name)}"
             parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else far)
     elif outcome == "not reached":
         parts.append("the run starts at its target")
@@ -151,7 +151,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     return ", ".join([*parts, f"{end} at the end"])
 
 
-def _unit(judge: Judge, name: str) -> str:
+def unit_of_error(judge: Judge, name: str) -> str:
     """Return the unit of an output's error; joints of both kinds have none."""
     units = {*judge.setup.units} if name == "q" else {"m" if name == "x" else "rad"}
     return units.pop() or "rad" if len(units) == 1 else "rad or m"
