@@ -161,7 +161,8 @@ def test_a_load_that_changes_is_absent_from_the_start(fmus: dict[str, Path], tmp
 def test_gains_that_are_far_too_slow_are_not_tried_for_hours(fmus: dict[str, Path]) -> None:
     settings = {"Kp": 0.01, "Kd": 20.0}
     verdict = twodof.simulate(fmus["task"], settings=settings, step=10.0, stop_time=10.0).verdict
-    assert [cause.tried for cause in verdict.causes if cause.kind == "time"] == [""]
+    tried = [cause.tried for cause in verdict.causes if cause.kind == "time"]
+    assert len(tried) == 1 and tried[0].startswith("with Kp = 50 and Kd = 40: ")
 
 
 def test_a_run_with_a_locked_joint_has_a_verdict(fmus: dict[str, Path]) -> None:
@@ -310,6 +311,23 @@ def test_a_cause_that_acts_without_the_first_one_is_no_note(fmus: dict[str, Path
     cured = twodof.simulate(fmus["joint"], settings={**settings, **without})
     assert "payload" in lines[0] and lines[1].startswith("also joint"), lines
     assert float(re.findall(r"without both: ([\d.e-]+) rad", lines[1])[0]) == pytest.approx(error(cured), rel=6e-3)
+
+
+def test_gains_that_need_longer_than_ten_runs_are_tried_with_the_usual_ones(fmus: dict[str, Path]) -> None:
+    target = {"x_des": (0.4, 0.1, 0.4), "quat_des": (0.3, 0.9, 0.1, 0.2), "Kp_rot": 1.0}
+    first = twodof.simulate(fmus["pose"], settings=target).verdict.lines[0]
+    cured = twodof.simulate(fmus["pose"], settings={**target, "Kp_rot": 50.0})
+    texts = re.findall(
+        r"still approaches.* about \d+ s more \(with Kp_rot = 50: ([\d.e-]+) rad\); raise Kp_rot, or", first
+    )
+    assert texts, first
+    assert float(texts[0]) == pytest.approx(cured.turn_error, rel=6e-3)
+
+
+def test_a_limit_beyond_which_the_target_is_stays_a_note(fmus: dict[str, Path]) -> None:
+    coarse = {"q_des": (0.9, 0.8), "q_max": (3.0, 0.7848), "control_period": 0.01, "q_resolution": 0.0186}
+    causes = twodof.simulate(fmus["joint"], settings=coarse).verdict.causes
+    assert {cause.kind: cause.noted for cause in causes} == {"sampling": False, "reach": False, "limit": True}
 
 
 def test_slow_gains_are_a_cause_if_no_other_removal_helps(fmus: dict[str, Path]) -> None:

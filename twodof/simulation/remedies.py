@@ -65,9 +65,7 @@ def without(judge: Judge, cause: Cause) -> Repetition | None:
             exact = {name: type(value)(0) for name, value in held.items() if name.partition("[")[0] in SAMPLING}
             return plan("with a continuous controller and exact sensors", exact)
         case "gain":
-            raised = _usual(judge) if cause.subject else _raised(judge)
-            gains = dict.fromkeys(f"{name.partition('[')[0]} = {value:g}" for name, value in raised.items())
-            return plan(f"with {' and '.join(gains)}", raised)
+            return _with_gains(judge, unusual(judge) if cause.subject else _raised(judge))
         case "damping":
             return plan("with critical damping", _critical(judge))
         case "degrees":
@@ -76,6 +74,8 @@ def without(judge: Judge, cause: Cause) -> Repetition | None:
             return plan("with a target in reach", _in_reach(judge, cause))
         case "time" if not judge.moving and cause.share <= LONGER * judge.duration:
             return Repetition(f"after {judge.duration + cause.share:.4g} s", longer=cause.share)
+        case "time" if not judge.moving and (settings := unusual(judge, cause.subject)):
+            return _with_gains(judge, settings)
     return None
 
 
@@ -122,9 +122,17 @@ def stiffer(judge: Judge) -> Repetition:
     return Repetition(f"with {named(values)}", tuple(settings.items()))
 
 
-def _usual(judge: Judge) -> dict[str, float]:
-    """Return the usual gains."""
-    return {f"{g}[{i + 1}]": USUAL[g] for pair in GAINS for g in pair for i in range(len(judge.given(g)))}
+def unusual(judge: Judge, stiff: str = "") -> dict[str, float]:
+    """Return the usual value of each gain that has another one; ``stiff`` is the proportional gain of one output."""
+    pairs = [pair for pair in GAINS if stiff in ("", pair[0])]
+    each = [(group, i, gain) for pair in pairs for group in pair for i, gain in enumerate(judge.given(group))]
+    return {f"{group}[{i + 1}]": USUAL[group] for group, i, gain in each if gain != USUAL[group]}
+
+
+def _with_gains(judge: Judge, settings: Mapping[str, float]) -> Repetition:
+    """Return the run with other gains."""
+    gains = dict.fromkeys(f"{name.partition('[')[0]} = {value:g}" for name, value in settings.items())
+    return Repetition(f"with {' and '.join(gains)}", tuple(settings.items()))
 
 
 def _critical(judge: Judge) -> dict[str, float]:

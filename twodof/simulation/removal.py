@@ -1,20 +1,21 @@
 """Order of the causes of a failed run, by the errors of repeated runs without each of them."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from math import inf, isfinite
 
 import numpy as np
 
 from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
-from .controller_causes import GAINS, damping, feedforward, load
+from .controller_causes import damping, feedforward, load
 from .judge import OF_THE_END, Judge
-from .remedies import SAMPLING, Repetition, named, stiffer, without
+from .remedies import SAMPLING, Repetition, named, stiffer, unusual, without
 from .verdict_text import unit_of_error, worst_joint
 
 LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
 HALF = 0.5  # part of the error; if no cause removes as much, all other settings are tried
 WHOLE = 0.9  # part of the error whose removal explains all consequences
-ADVICE = "; raise Kp"
+ADVICE = re.compile("; raise Kp(?=$|;)")
 
 
 Repeat = Callable[[Sequence[Repetition]], Sequence[Judge | None]]
@@ -44,7 +45,8 @@ def by_removal(
     if _most(tried) < HALF:
         others = trials.tried(_others(judge, missed, why))
         tried += [cause for cause in others if (cause.removes or 0.0) >= LITTLE]
-    if max(_most(tried), trials.without_all(tried)) < LITTLE:
+    slow = any(cause.kind == "time" for cause in tried)
+    if not slow and max(_most(tried), trials.without_all(tried)) < LITTLE:
         tried += [cause for cause in trials.tried([*_gains(judge)]) if (cause.removes or 0.0) >= LITTLE]
     most = _most(tried)
     if most >= LITTLE or any(map(_is_open, tried)):
@@ -55,14 +57,16 @@ def by_removal(
         ]
         tried = sorted(counted, key=lambda cause: _rank(cause, max(0.0, 1.0 - most)))
     elif both := next((some for some in (tried, tried + others) if trials.without_all(some) >= LITTLE), None):
-        tried = [cause._replace(noted=cause.noted and not cause.tried) for cause in both]  # only together they keep it
+        tried = [c._replace(noted=_is_beyond(c, both) or (c.noted and not c.tried)) for c in both]  # they act together
         tried.sort(key=lambda cause: _rank(cause, 0.0))
     root = trials.result(tried[0]) if tried else None
     if root is None:
         return tuple(tried)
     left = {(c.kind, c.joint, c.subject): c for c in causes_of(root) if not c.noted}
     known = [(cause.kind, cause.joint, cause.subject) for cause in tried]
-    tried = [c._replace(noted=c.noted and key not in left) for c, key in zip(tried, known)]  # it acts without the first
+    tried = [
+        c._replace(noted=c.noted and (key not in left or _is_beyond(c, tried))) for c, key in zip(tried, known)
+    ]  # it acts without the first
     rest = [cause for key, cause in left.items() if key not in known]
     rest = [cause._replace(text=f"without the first cause: {cause.text}", part=None) for cause in rest[:1]]
     first, *others = trials.together(tried)
@@ -124,11 +128,11 @@ class _Trials:
 
     def advised(self, cause: Cause) -> Cause:
         """Return a cause with the errors of a run with its advice to raise Kp; without the advice, if it is wrong."""
-        if ADVICE not in cause.text or (result := self._repeat([plan := stiffer(self._judge)])[0]) is None:
+        if not ADVICE.search(cause.text) or (result := self._repeat([plan := stiffer(self._judge)])[0]) is None:
             return cause
         helps = self._size(result) < HALF * self._size(self._judge)
-        advice = f"{ADVICE} ({plan.words}: {self._errors(result)})" if helps else ""
-        return cause._replace(text=cause.text.replace(ADVICE, advice))
+        advice = f"; raise Kp ({plan.words}: {self._errors(result)})" if helps else ""
+        return cause._replace(text=ADVICE.sub(lambda _: advice, cause.text))
 
     def _size(self, result: Judge) -> float:
         """Return the sum of the RMS errors at the end of a run, relative to the largest errors of the first one."""
@@ -173,8 +177,16 @@ def _is_noted(cause: Cause, tried: Sequence[Cause], most: float) -> bool:
         return True
     kinds = {other.kind for other in tried}
     led = cause.kind in FOLLOWING or (cause.kind == "reach" and "degrees" in kinds)
-    beyond = cause.kind == "limit" and any(c.kind in ("reach", "degrees") and c.joint == cause.joint for c in tried)
-    return beyond or (led and most > WHOLE and cause.removes != most) or (cause.noted and cause.removes is None)
+    return (
+        _is_beyond(cause, tried)
+        or (led and most > WHOLE and cause.removes != most)
+        or (cause.noted and cause.removes is None)
+    )
+
+
+def _is_beyond(cause: Cause, tried: Sequence[Cause]) -> bool:
+    """Return whether a joint is at a limit because its target is beyond it."""
+    return cause.kind == "limit" and any(c.kind in ("reach", "degrees") and c.joint == cause.joint for c in tried)
 
 
 def _is_open(cause: Cause) -> bool:
@@ -218,6 +230,7 @@ def _sampling(judge: Judge) -> Iterator[Cause]:
 
 def _gains(judge: Judge) -> Iterator[Cause]:
     """Yield gains that differ from the usual ones as a cause."""
-    values = {group: judge.given(group) for pair in GAINS for group in pair if judge.given(group).size}
-    if values:
+    if values := {
+        group: judge.given(group) for group in dict.fromkeys(name.partition("[")[0] for name in unusual(judge))
+    }:
         yield Cause("gain", f"the gains are {named(values)}", subject="usual")

@@ -47,7 +47,7 @@ def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> It
             else:
                 text += f": 2 % takes about {left:.3g} s more"
                 remedy += ", or stop later"
-            yield Cause("time", f"{text}; {remedy}", left)
+            yield Cause("time", f"{text}; {remedy}", left, subject=stiff)
 
 
 def _alone(judge: Judge) -> int | None:
