@@ -49,6 +49,7 @@ ALSO_INDEX = '<Unknown index="4"/>', '<Unknown index="4"/><Unknown index="6"/>'
 FAULTS = {
     "KEEPS": ("reset", "after a reset: y is"),
     "SHARES": ("two instances", "beside a second instance: y is"),
+    "SHARES_PARAMETER": ("two instances", "beside a second instance: y is"),
     "RESTORES_NOTHING": ("state", "at the restored state: y is"),
     "LOSES_BYTES": ("serialised state", "at the restored state: y is"),
     "WRONG_SLOPE": ("derivatives", "∂y/∂u is 2, and it gives 2.00002"),
@@ -203,6 +204,16 @@ def test_another_start_value_than_the_stated_one_fails(tmp_path: Path) -> None:
     described = DESCRIPTION.replace('variability="fixed"><Real start="1"/>', 'variability="fixed"><Real start="2"/>')
     texts = failed(twodof.check(foreign(tmp_path, description=described)))
     assert texts == {"start values": "p is 1.0 before it is set, and its start value is 2.0"}
+
+
+def test_integers_and_truth_values_have_their_start_values(tmp_path: Path) -> None:
+    """FMI 2.0.4, section 2.2.7; those of native/pd.c are 0 and true."""
+    integer, truth = {'Integer start="0"': 'Integer start="2"'}, {'Boolean start="true"': 'Boolean start="false"'}
+    changes: list[dict[str, str]] = [{}, integer, truth]
+    for changed in changes:
+        (tmp_path / "pd.fmu").write_bytes(pd_fmu(replaced=changed))
+        found = failed(twodof.check(tmp_path / "pd.fmu"))
+        assert ("start values" in found) == bool(changed)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])

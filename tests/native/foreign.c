@@ -9,19 +9,20 @@
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
        READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
        KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
-       RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE };
+       RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE, SHARES_PARAMETER };
 #ifndef X
 #define X 1.0
 #endif
 typedef struct { double u, x, p; int phase; double t; } M;
 static double shared;
 static int count, living;
+static double shared_p;
 static char names[8][80];
 static M *owners[8];
 static void start(M *m) { *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0, 0.0}; }
 static double y_of(M *m) {
     return (FAULT == SHARES ? shared : m->x) + (FAULT == OLD_SLOPE ? 2.0 + 10.0 * m->t : 2.0) * m->u
-        + (FAULT == HIGH ? 1e6 : 0.0);
+        + (FAULT == HIGH ? 1e6 : 0.0) + (FAULT == SHARES_PARAMETER ? shared_p : 0.0);
 }
 
 fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
@@ -53,7 +54,12 @@ fmi2Status fmi2Reset(fmi2Component c) {
     return fmi2OK;
 }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return ((M *)c)->phase ? fmi2Error : fmi2OK; }
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) { shared = ((M *)c)->x; ((M *)c)->phase = 1; return fmi2OK; }
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    shared = ((M *)c)->x;
+    shared_p = ((M *)c)->p;
+    ((M *)c)->phase = 1;
+    return fmi2OK;
+}
 fmi2Status fmi2Terminate(fmi2Component c) { ((M *)c)->phase = 2; return fmi2OK; }
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, const fmi2Real v[]) {
     M *m = c;

@@ -39,6 +39,7 @@ class Trial:
         variables: FMPy's descriptions of real variables, by the names of their elements.
         outputs, inputs: names of real outputs and continuous inputs.
         starts: start values of real inputs and parameters that have one.
+        discrete_starts: those of integers and Booleans.
         others: names of integer and Boolean outputs.
     """
 
@@ -64,6 +65,8 @@ class Trial:
         known = [name for name, v in self.variables.items() if v.causality in ("input", "parameter")]
         values = ((name, fmu.variables[name].start_value) for name in known)
         self.starts = {name: value for name, value in values if value is not None}
+        discrete = [v for v in fmu.variables.values() if v.type in ("Integer", "Boolean") and v.start is not None]
+        self.discrete_starts = {v.name: v.start_value for v in discrete if v.causality in ("input", "parameter")}
 
     def changed_inputs(self) -> dict[str, float]:
         """Return values of the inputs that differ from their start values, so that an FMU at rest moves."""

@@ -39,14 +39,17 @@ def simulation(trial: Trial) -> str:
 
 
 def start_values(trial: Trial) -> str:
-    """Compare real inputs and parameters in initialisation mode with their start values."""
-    if not trial.starts:
+    """Compare inputs and parameters in initialisation mode with their start values."""
+    if not trial.starts and not trial.discrete_starts:
         raise UnpassedError("does not apply", "it states no start values of inputs or parameters")
     trial.note("initialisation mode")
     with instantiate_fmu(trial.fmu) as instance:
         instance.begin(trial.start, inf, {})
         _compare_starts(trial, instance, trial.starts, "before it is set")
-    return f"{len(trial.starts)} inputs and parameters have their start values"
+        for name, start in trial.discrete_starts.items():
+            if (value := instance.value(name)) != start:
+                raise SimulationError(f"{name} is {value} before it is set, and its start value is {start}")
+    return f"{len(trial.starts) + len(trial.discrete_starts)} inputs and parameters have their start values"
 
 
 def _compare_starts(trial: Trial, instance: Instance, expected: Mapping[str, float], when: str) -> None:
@@ -72,12 +75,12 @@ def reset(trial: Trial) -> str:
 
 
 def two_instances(trial: Trial) -> str:
-    """Step two instances of one library in turn, one with other inputs."""
+    """Step two instances of one library in turn, one with other inputs and parameters."""
     if trial.about.coSimulation.canBeInstantiatedOnlyOncePerProcess:
         raise UnpassedError("does not apply", "it states canBeInstantiatedOnlyOncePerProcess")
     trial.require_outputs()
-    given: tuple[dict[str, float], ...] = {}, trial.changed_inputs()
     with trial.instance() as first:
+        given: tuple[dict[str, float], ...] = {}, _other_values(trial, first)
 
         def begun(values: Mapping[str, float]) -> Instance:
             instance = first.another()
@@ -97,6 +100,18 @@ def two_instances(trial: Trial) -> str:
         for instance in pair:
             instance.free()
     return "two instances, stepped in turn, are equal to one alone"
+
+
+def _other_values(trial: Trial, instance: Instance) -> dict[str, float]:
+    """Return other values of inputs and parameters; of inputs alone if the FMU refuses the parameters."""
+    inputs = trial.changed_inputs()
+    both = {**inputs, **trial.changed_parameters()}
+    try:
+        trial.begin_again(instance, both)
+        trial.rows(instance)
+    except SimulationError:
+        return inputs
+    return both
 
 
 def state(trial: Trial) -> str:
