@@ -45,6 +45,10 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 """
 COUNT = """<ScalarVariable name="n" valueReference="6" causality="output" variability="discrete"><Integer/>
 </ScalarVariable></ModelVariables>"""
+DISCRETE = """<ScalarVariable name="k" valueReference="7" causality="input" variability="discrete">
+<Integer start="3" max="3"/></ScalarVariable>
+<ScalarVariable name="b" valueReference="8" causality="parameter" variability="fixed"><Boolean start="false"/>
+</ScalarVariable></ModelVariables>"""
 ALSO_INDEX = '<Unknown index="4"/>', '<Unknown index="4"/><Unknown index="6"/>'
 FAULTS = {
     "KEEPS": ("reset", "after a reset: y is"),
@@ -62,15 +66,22 @@ FAULTS = {
     "KEEPS_PARAMETER": ("reset", "p is 1.0001 after a reset, and its start value is 1.0"),
     "RESTORES_NO_INPUT": ("state", "at the restored state: y is"),
     "OLD_SLOPE": ("derivatives", "∂y/∂u is 3.937 after 19 steps, and it gives 2"),
+    "KEEPS_INTEGER": ("reset", "k is 2 after a reset, and its start value is 3"),
+    "KEEPS_BOOLEAN": ("reset", "b is True after a reset, and its start value is False"),
+    "LOSES_TUNABLE": ("state", "at the restored state: y is"),
+    "LOSES_INTEGER": ("state", "at the restored state: y is"),
     "ONE_SEED": ("derivatives", "the derivative of y with a seed of several variables is 2"),
 }
 ALSO = {
     "SHARES": ("state", "serialised state"),
     "RESTORES_NOTHING": ("serialised state",),
     "RESTORES_NO_INPUT": ("serialised state",),
+    "LOSES_TUNABLE": ("serialised state",),
+    "LOSES_INTEGER": ("serialised state",),
     "CRASHES": ("serialised state",),
     "COUNTS": ("simulation", "two instances", "state", "serialised state"),
 }
+OF_OTHER_KINDS = "KEEPS_INTEGER", "KEEPS_BOOLEAN", "LOSES_TUNABLE", "LOSES_INTEGER"
 REMARK = "it accepts the end of an initialisation that was not begun, a step of a negative size, a step from another"
 
 
@@ -104,8 +115,9 @@ def test_fmus_of_this_project_pass(kind: str, tmp_path: Path, fmu_path: Path, na
     assert len(outcomes) == 12 and check.passed
 
 
-def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
-    check = twodof.check(foreign(tmp_path))
+@pytest.mark.parametrize("more", ["</ModelVariables>", DISCRETE])
+def test_an_fmu_of_another_maker_passes_with_a_remark(more: str, tmp_path: Path) -> None:
+    check = twodof.check(foreign(tmp_path, description=DESCRIPTION.replace("</ModelVariables>", more)))
     others = {row.name: row.outcome for row in check.rows if row.outcome != "passed"}
     assert others == {"call order": "remark", "references": "does not apply"}
     assert check.rows[-2].text.startswith(REMARK)
@@ -115,9 +127,11 @@ def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
 def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
     """A crash affects no other row."""
     row, text = FAULTS[fault]
-    described = (
-        DESCRIPTION.replace("</ModelVariables>", COUNT).replace(*ALSO_INDEX) if fault == "COUNTS" else DESCRIPTION
-    )
+    described = DESCRIPTION
+    if fault == "COUNTS":
+        described = DESCRIPTION.replace("</ModelVariables>", COUNT).replace(*ALSO_INDEX)
+    if fault in OF_OTHER_KINDS:
+        described = DESCRIPTION.replace("</ModelVariables>", DISCRETE).replace('="fixed"><Real', '="tunable"><Real')
     check = twodof.check(foreign(tmp_path, fault, described))
     assert failed(check)[row].startswith(text)
     if fault not in ("NOT_FINITE", "DISCARDS", "READS_CHANGE"):

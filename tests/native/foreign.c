@@ -9,20 +9,22 @@
 enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS,
        READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
        KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
-       RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE, SHARES_PARAMETER };
+       RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE, SHARES_PARAMETER,
+       KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER };
 #ifndef X
 #define X 1.0
 #endif
-typedef struct { double u, x, p; int phase; double t; } M;
+typedef struct { double u, x, p; int phase; double t; int k, b; } M;
 static double shared;
 static int count, living;
 static double shared_p;
 static char names[8][80];
 static M *owners[8];
-static void start(M *m) { *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0, 0.0}; }
+static void start(M *m) { *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0, 0.0, 3, 0}; }
 static double y_of(M *m) {
     return (FAULT == SHARES ? shared : m->x) + (FAULT == OLD_SLOPE ? 2.0 + 10.0 * m->t : 2.0) * m->u
-        + (FAULT == HIGH ? 1e6 : 0.0) + (FAULT == SHARES_PARAMETER ? shared_p : 0.0);
+        + (FAULT == HIGH ? 1e6 : 0.0) + (FAULT == SHARES_PARAMETER ? shared_p : FAULT == LOSES_TUNABLE ? m->p : 0.0)
+        + (FAULT == LOSES_INTEGER ? m->k : 0);
 }
 
 fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
@@ -51,6 +53,8 @@ fmi2Status fmi2Reset(fmi2Component c) {
     if (FAULT == KEEPS) ((M *)c)->x = old.x;
     if (FAULT == KEEPS_INPUT) ((M *)c)->u = old.u;
     if (FAULT == KEEPS_PARAMETER) ((M *)c)->p = old.p;
+    if (FAULT == KEEPS_INTEGER) ((M *)c)->k = old.k;
+    if (FAULT == KEEPS_BOOLEAN) ((M *)c)->b = old.b;
     return fmi2OK;
 }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return ((M *)c)->phase ? fmi2Error : fmi2OK; }
@@ -93,9 +97,12 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) { *s = malloc(sizeof(M)); *(M *)*s = *(M *)c; return fmi2OK; }
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
     if (FAULT == CRASHES) abort();
-    double u = ((M *)c)->u;
+    double u = ((M *)c)->u, p = ((M *)c)->p;
+    int k = ((M *)c)->k;
     if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;
     if (FAULT == RESTORES_NO_INPUT) ((M *)c)->u = u;
+    if (FAULT == LOSES_TUNABLE) ((M *)c)->p = p;
+    if (FAULT == LOSES_INTEGER) ((M *)c)->k = k;
     return fmi2OK;
 }
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *s) { free(*s); *s = NULL; return fmi2OK; }
@@ -132,11 +139,18 @@ fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean l, size_t n, const f
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
 typedef const fmi2ValueReference R[];
-fmi2Status fmi2GetInteger(fmi2Component c, R r, size_t n, fmi2Integer v[]) { v[0] = ++count; return fmi2OK; }
-NOT_THERE(fmi2GetBoolean, R r, size_t n, fmi2Boolean v[])
+fmi2Status fmi2GetInteger(fmi2Component c, R r, size_t n, fmi2Integer v[]) {
+    v[0] = r[0] == 6 ? ++count : ((M *)c)->k;
+    return fmi2OK;
+}
+fmi2Status fmi2GetBoolean(fmi2Component c, R r, size_t n, fmi2Boolean v[]) { v[0] = ((M *)c)->b; return fmi2OK; }
+fmi2Status fmi2SetInteger(fmi2Component c, R r, size_t n, const fmi2Integer v[]) {
+    if (v[0] > 3) return fmi2Error;
+    ((M *)c)->k = v[0];
+    return fmi2OK;
+}
+fmi2Status fmi2SetBoolean(fmi2Component c, R r, size_t n, const fmi2Boolean v[]) { ((M *)c)->b = v[0]; return fmi2OK; }
 NOT_THERE(fmi2GetString, R r, size_t n, fmi2String v[])
-NOT_THERE(fmi2SetInteger, R r, size_t n, const fmi2Integer v[])
-NOT_THERE(fmi2SetBoolean, R r, size_t n, const fmi2Boolean v[])
 NOT_THERE(fmi2SetString, R r, size_t n, const fmi2String v[])
 NOT_THERE(fmi2SetRealInputDerivatives, R r, size_t n, const fmi2Integer o[], const fmi2Real v[])
 NOT_THERE(fmi2GetRealOutputDerivatives, R r, size_t n, const fmi2Integer o[], fmi2Real v[])

@@ -68,6 +68,15 @@ class Point:
         self.values = {name: trial.inside(name, 2.0 * width) for name, width in self._widths.items()}
         self.unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
 
+    def keep_inside(self, instance: Instance) -> None:
+        """Move states that the FMU clamps, because a parameter bounds them, below their start values."""
+        states = [name for name in self.values if name not in self._trial.inputs]
+        far = {name: self.values[name] + self._widths[name] for name in states}
+        self._trial.begin_again(instance, {**self.values, **far})
+        for name, value in zip(states, instance.reader(states)()):
+            if abs(value - far[name]) > 0.5 * self._widths[name]:
+                self.values[name] -= 4.0 * self._widths[name]
+
     def slopes(self, instance: Instance, name: str, change: Callable[[Mapping[str, float]], object]) -> Slopes:
         """Return the slopes over a variable, which is changed by a function."""
         read, width = instance.reader(self.unknowns), self._widths[name]
@@ -145,6 +154,8 @@ def derivatives(trial: Trial) -> str:
     point = Point(trial)
     jumps, samples, doubtful = 0, False, ""
     with trial.instance(point.values) as instance:
+        point.keep_inside(instance)
+        trial.begin_again(instance, point.values)
         trial.note("directional derivatives")
         stated = instance.derivatives(point.unknowns, [*point.values])
         _check_sum(instance, point, stated)

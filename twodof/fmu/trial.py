@@ -16,6 +16,8 @@ from .system_instance import instantiate_fmu
 
 STEPS = 20
 DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
+INTEGERS = ("Integer", "Int32")
+LARGEST = 2**31 - 1
 Outputs = tuple[float, ...]
 
 
@@ -40,6 +42,7 @@ class Trial:
         outputs, inputs: names of real outputs and continuous inputs.
         starts: start values of real inputs and parameters that have one.
         discrete_starts: those of integers and Booleans.
+        changing: names of inputs and parameters that may change between steps.
         others: names of integer and Boolean outputs.
     """
 
@@ -65,8 +68,11 @@ class Trial:
         known = [name for name, v in self.variables.items() if v.causality in ("input", "parameter")]
         values = ((name, fmu.variables[name].start_value) for name in known)
         self.starts = {name: value for name, value in values if value is not None}
-        discrete = [v for v in fmu.variables.values() if v.type in ("Integer", "Boolean") and v.start is not None]
-        self.discrete_starts = {v.name: v.start_value for v in discrete if v.causality in ("input", "parameter")}
+        discrete = [v for v in fmu.variables.values() if v.type in ("Integer", "Boolean")]
+        values = ((v.name, v.start_value) for v in discrete if v.causality in ("input", "parameter"))
+        self.discrete_starts = {name: value for name, value in values if value is not None}
+        given = (fmu.variables[name] for name in (*self.starts, *self.discrete_starts))
+        self.changing = {v.name for v in given if v.causality == "input" or v.variability == "tunable"}
 
     def changed_inputs(self) -> dict[str, float]:
         """Return values of the inputs that differ from their start values, so that an FMU at rest moves."""
@@ -81,6 +87,17 @@ class Trial:
             if self.variables[name].causality == "parameter" and self.variables[name].variability != "constant"
         }
 
+    def changed_discrete(self) -> dict[str, float | bool]:
+        """Return values of integers and Booleans that differ from their start values."""
+        most = {v.valueReference: int(v.max or LARGEST) for v in self.about.modelVariables if v.type in INTEGERS}
+
+        def other(name: str, start: float | bool) -> float | bool:
+            if isinstance(start, bool):
+                return not start
+            return start - 1 if start == most[self.fmu.variables[name].reference] else start + 1
+
+        return {name: other(name, start) for name, start in self.discrete_starts.items()}
+
     def require(self, *claims: str) -> None:
         """End a trial of a feature that the description does not claim."""
         for claim in claims:
@@ -88,14 +105,14 @@ class Trial:
                 raise UnpassedError("does not apply", f"it does not state {claim}")
 
     @contextmanager
-    def instance(self, values: Mapping[str, float] | None = None) -> Iterator[Instance]:
+    def instance(self, values: Mapping[str, float | bool] | None = None) -> Iterator[Instance]:
         """Instantiate and initialise the FMU."""
         self.note("instantiation and initialisation")
         with instantiate_fmu(self.fmu) as instance:
             instance.initialise(self.start, inf, values or {})
             yield instance
 
-    def begin_again(self, instance: Instance, values: Mapping[str, float] | None = None) -> None:
+    def begin_again(self, instance: Instance, values: Mapping[str, float | bool] | None = None) -> None:
         """Reset and initialise an instance."""
         self.note("reset")
         instance.reset()

@@ -29,6 +29,7 @@ SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 FORBIDDEN = "a forbidden call"
 UNKNOWN = 2**31 - 9  # a value reference that no variable has
 Calls = dict[str, tuple[str, Callable[[Instance], object]]]
+Values = dict[str, float | bool]
 
 
 def simulation(trial: Trial) -> str:
@@ -46,9 +47,7 @@ def start_values(trial: Trial) -> str:
     with instantiate_fmu(trial.fmu) as instance:
         instance.begin(trial.start, inf, {})
         _compare_starts(trial, instance, trial.starts, "before it is set")
-        for name, start in trial.discrete_starts.items():
-            if (value := instance.value(name)) != start:
-                raise SimulationError(f"{name} is {value} before it is set, and its start value is {start}")
+        _compare_discrete(trial, instance, "before it is set")
     return f"{len(trial.starts) + len(trial.discrete_starts)} inputs and parameters have their start values"
 
 
@@ -59,17 +58,25 @@ def _compare_starts(trial: Trial, instance: Instance, expected: Mapping[str, flo
             raise SimulationError(f"{name} is {value!r} {when}, and its start value is {start!r}")
 
 
+def _compare_discrete(trial: Trial, instance: Instance, when: str) -> None:
+    """Raise for an integer or Boolean that has another value than its start value."""
+    for name, start in trial.discrete_starts.items():
+        if (value := instance.value(name)) != start:
+            raise SimulationError(f"{name} is {value} {when}, and its start value is {start}")
+
+
 def reset(trial: Trial) -> str:
     """Run, run with other inputs and parameters, reset and run again."""
     trial.require_outputs()
     with trial.instance() as instance:
         before = dict(zip(trial.starts, instance.reader([*trial.starts])()))
         once = trial.rows(instance)
-        with suppress(SimulationError):  # the FMU may refuse a combination of values
-            trial.begin_again(instance, {**trial.changed_inputs(), **trial.changed_parameters()})
+        with suppress(SimulationError):
+            trial.begin_again(instance, _other_values(trial, instance))
             trial.rows(instance)
         trial.begin_again(instance)
         _compare_starts(trial, instance, before, "after a reset")
+        _compare_discrete(trial, instance, "after a reset")
         trial.compare(once, trial.rows(instance), "after a reset")
     return "the run after a reset, and after a run with other values, is equal"
 
@@ -80,9 +87,9 @@ def two_instances(trial: Trial) -> str:
         raise UnpassedError("does not apply", "it states canBeInstantiatedOnlyOncePerProcess")
     trial.require_outputs()
     with trial.instance() as first:
-        given: tuple[dict[str, float], ...] = {}, _other_values(trial, first)
+        given: tuple[Values, ...] = {}, _other_values(trial, first)
 
-        def begun(values: Mapping[str, float]) -> Instance:
+        def begun(values: Values) -> Instance:
             instance = first.another()
             instance.initialise(trial.start, inf, values)
             return instance
@@ -102,31 +109,42 @@ def two_instances(trial: Trial) -> str:
     return "two instances, stepped in turn, are equal to one alone"
 
 
-def _other_values(trial: Trial, instance: Instance) -> dict[str, float]:
-    """Return other values of inputs and parameters; of inputs alone if the FMU refuses the parameters."""
-    inputs = trial.changed_inputs()
-    both = {**inputs, **trial.changed_parameters()}
-    try:
-        trial.begin_again(instance, both)
-        trial.rows(instance)
-    except SimulationError:
-        return inputs
-    return both
+def _other_values(trial: Trial, instance: Instance) -> Values:
+    """Return other values of inputs, of real parameters, and of integers and Booleans, of each if the FMU runs so."""
+    values: Values = {}
+    for change in (trial.changed_inputs(), trial.changed_parameters(), trial.changed_discrete()):
+        with suppress(SimulationError):
+            trial.begin_again(instance, {**values, **change})
+            trial.rows(instance)
+            values |= change
+    return values
+
+
+def _changing_values(trial: Trial) -> tuple[Values, Values]:
+    """Return other values, and the start values, of inputs and parameters that may change between steps."""
+    starts = {**trial.starts, **trial.discrete_starts}
+    if {*trial.inputs} >= trial.changing:
+        values: Values = {**trial.changed_inputs()}
+    else:
+        with trial.instance() as instance:
+            values = {n: value for n, value in _other_values(trial, instance).items() if n in trial.changing}
+    return values, {name: starts[name] for name in values if name in starts}
 
 
 def state(trial: Trial) -> str:
     """Save the state, step, restore it and step again."""
     trial.require("canGetAndSetFMUstate")
-    with trial.instance(trial.changed_inputs()) as instance:
+    values, starts = _changing_values(trial)
+    with trial.instance(values) as instance:
         saved, rows = _saved(trial, instance)
-        instance.set({name: trial.starts[name] for name in trial.inputs if name in trial.starts})
+        instance.set(starts)
         return _restored(trial, instance, saved, rows)
 
 
 def serialised_state(trial: Trial) -> str:
     """Restore a serialised state in a new instance, after the old one and its state were freed."""
     trial.require("canGetAndSetFMUstate", "canSerializeFMUstate")
-    with trial.instance(trial.changed_inputs()) as instance:
+    with trial.instance(_changing_values(trial)[0]) as instance:
         saved, rows = _saved(trial, instance)
         content = bytes(instance.slave.serializeFMUState(saved))
         instance.slave.freeFMUState(saved)
