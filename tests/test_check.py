@@ -240,6 +240,15 @@ def test_a_sampled_controller_passes(part: Any, delay: float, tmp_path: Path) ->
     assert not failed(check), str(check)
 
 
+@pytest.mark.parametrize("limit", [0.5, 0.50025])
+def test_derivatives_are_compared_inside_a_limit_that_a_parameter_states(limit: float, tmp_path: Path) -> None:
+    """The start position is 0.5, and the description's range of q[1] is that of the URDF."""
+    options = twodof.FmuOptions(native=True, control="joint", settings={"q_max": (limit, 3.0)})
+    check = twodof.check(twodof.build_fmu(tmp_path / "arm.fmu", options))
+    row = {row.name: row for row in check.rows}["derivatives"]
+    assert row.outcome == "passed" and ("at a jump" in row.text) == (limit > 0.5), str(check)
+
+
 def test_a_crash_at_a_forbidden_call_is_a_remark(tmp_path: Path) -> None:
     row = twodof.check(foreign(tmp_path, "FRAGILE")).rows[-2]
     text = "it ended its process at: a forbidden call, a read of a variable that does not exist: Aborted"

@@ -291,6 +291,37 @@ def test_only_a_target_in_si_units_that_drives_the_robot_is_its_target(plant: by
         assert (twodof.run(path, step=H, stop_time=N * H).verdict.outcome != "no target") == is_target
 
 
+@pytest.mark.parametrize(
+    ("unit", "wires", "name"),
+    [
+        ("rad", WIRES, "q_des"),
+        ("deg", WIRES, "system.q_des"),
+        ("rad", connection("plant.q[1]", "pd.q[1]"), "system.q_des"),
+    ],
+)
+def test_a_connector_is_the_target_only_in_si_units_if_it_drives_the_robot(
+    unit: str, wires: str, name: str, plant: bytes, pd: bytes, tmp_path: Path
+) -> None:
+    ports = connectors({f"q_des[{i}]": f"input {unit}" for i in (1, 2)})
+    plain = loop(tmp_path / "plain.ssp", plant, pd, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
+    wires += "".join(connection(f"q_des[{i}]", f"pd.q_des[{i}]") for i in (1, 2))
+    structure = ssd(f"{ports}{BOTH}<ssd:Connections>{wires}</ssd:Connections>", f"<ssd:Units>{DEGREE}</ssd:Units>")
+    path = loop(tmp_path / "loop.ssp", plant, pd, structure)
+    system = twodof.load_fmu(path)
+    assert {*system.groups("input")} >= {name} and bool(system.vector("q_des")) == (name == "q_des")
+    goal, gains = {name: np.rad2deg(TARGET) if unit == "deg" else TARGET}, dict(pd__Kp=0.1, pd__Kd=0.01)
+    expected = q_of(plain, **gains, pd__q_des=TARGET)
+    np.testing.assert_allclose(q_of(path, **gains, **goal), expected, rtol=0.0, atol=1e-14)
+    assert (twodof.run(path, step=H, stop_time=N * H).verdict.outcome != "no target") == (name == "q_des")
+
+
+def test_a_connector_does_not_hide_a_vector_of_the_robot(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    ports = connectors({"q[1]": "input"})
+    wires = f"<ssd:Connections>{WIRES}{connection('q[1]', 'pd.q_des[1]')}</ssd:Connections>"
+    system = twodof.load_fmu(loop(tmp_path / "loop.ssp", plant, pd, ssd(ports + BOTH + wires)))
+    assert [system.variables[name].causality for name in ("q[1]", "system.q[1]")] == ["output", "input"]
+
+
 def test_the_guid_of_a_system_depends_on_its_parameter_sets_and_the_files_of_its_fmus(
     plant: bytes, pd: bytes, tmp_path: Path
 ) -> None:

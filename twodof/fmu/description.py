@@ -26,7 +26,7 @@ from .archives import checksums, open_archive, read_archive
 from .scalar import Scalar, scalars
 from .validation import problems_of_names, problems_of_times, read_description
 
-RECORDED = ("q", "v", "x", "xd", "tau", "q_des", "x_des")
+RECORDED = ("q", "v", "x", "xd", "tau", "q_des", "x_des", "quat_des")
 """Vectors of a robot that bags, verdicts and plots contain in SI units."""
 SI = "a robot needs SI units, as rad, m and N.m"
 

@@ -140,7 +140,7 @@ def load_system(path: Path, robot: str = "") -> System:
     description.modelName, description.guid, description.defaultExperiment = title, digest.hexdigest(), times
     aliases: dict[str, str] = {}
     for name, node in places.items():
-        if (full := str(node)) != name:
+        if (full := str(node)) != name and node.element:
             aliases |= {full: name, full.rpartition("[")[0] or full: name.rpartition("[")[0] or name}
     own |= dict(variables=variables, description=description, control="", aliases=aliases)
     return System(
@@ -232,8 +232,8 @@ def _variables(
 ) -> tuple[dict[str, Scalar], dict[str, Node]]:
     """Return the variables of a system, and the component's variable or the connector for each of them.
 
-    Names without a component are those of the robot, except for measured values. A target is known by its own name,
-    which makes it the target of the robot, only if it drives the robot and is in SI units.
+    Names without a component are those of the robot, except for measured values, and those of the system's connectors.
+    A connector that could be mistaken for a vector of the robot is "system.connector".
     """
     variables: dict[str, Scalar] = {}
     places: dict[str, Node] = {}
@@ -245,6 +245,7 @@ def _variables(
         variables[name] = replace(scalar, name=name, causality=causality, start=text)
         places[name] = node
 
+    driving = _driving(links, robot)
     driven: dict[Node, list[Link]] = {}
     for link in links:
         driven.setdefault(link.source, []).append(link)
@@ -260,10 +261,10 @@ def _variables(
         inverted = {value if value is None else link.map.inverse(value) for link, value in zip(targets, values)}
         start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
         start = start if start is None else _typed(path, source, first, start)
-        add(str(source), source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
+        plain = _is_plain(wiring, source, first, driving & {link.target.element for link in targets})
+        add(str(source) if plain else f"system.{source}", source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
     ends = {link.target for link in links}
     names = Counter(name for fmu in fmus.values() for name in fmu.variables)
-    driving = _driving(links, robot)
     for element in (robot, *(name for name in fmus if name != robot)):
         for scalar in fmus[element].variables.values():
             node = Node(element, scalar.name)
@@ -271,13 +272,21 @@ def _variables(
                 alone = scalar.causality == "input" and node not in ends and names[scalar.name] == 1
                 group = scalar.name.partition("[")[0]
                 of = measuring if group in ("q_meas", "v_meas") else robot
-                if group in RECORDED:
-                    unit = wiring.unit(node)
-                    if unit.is_scaled and element == robot:
-                        raise FmuError(f"'{path}': {node} is in {unit.name}; {SI}")
-                    alone &= element in driving and scalar.type == "Real" and not unit.is_scaled
+                if group in RECORDED and element == robot and (unit := wiring.unit(node)).is_scaled:
+                    raise FmuError(f"'{path}': {node} is in {unit.name}; {SI}")
+                alone &= _is_plain(wiring, node, scalar, driving & {element})
                 own = (element == of or alone) and scalar.name not in variables
                 start = starts.get(node, scalar.start_value)
                 causality = "local" if node in ends else scalar.causality
                 add(scalar.name if own else str(node), node, scalar, causality, start)
     return variables, places
+
+
+def _is_plain(wiring: Wiring, node: Node, scalar: Scalar, driving: set[str]) -> bool:
+    """Return whether an input's name without a component cannot be mistaken for a vector of the robot.
+
+    Targets have the names of the robot's, if they are in SI units and drive the robot, through some components.
+    """
+    group = node.connector.partition("[")[0]
+    target = group.endswith("_des") and bool(driving) and scalar.type == "Real"
+    return group not in RECORDED or (target and not wiring.unit(node).is_scaled)
