@@ -6,8 +6,12 @@ import re
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from harness import python
+from native_models import robots_folder
+from scipy.spatial.transform import Rotation
+from test_pose import BENT, UR
 
 import twodof
 from twodof.testing import assert_equal, assert_settles, assert_within_limits
@@ -44,6 +48,28 @@ def test_settling_is_that_of_the_error(runs):
     off = float(((slow.x[300] - (0.2, 0.05)) ** 2).sum() ** 0.5)
     with pytest.raises(AssertionError, match=rf"does not settle, .* at 3 s its error is {off:.3g};"):
         assert_settles(slow, within=3.0)
+
+
+def test_the_error_that_settles_last_is_named(tmp_path):
+    """The position settles before the orientation, whose gains are low."""
+    options = twodof.FmuOptions(
+        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
+    )
+    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "ur.fmu", options))
+    first = next(twodof.samples(fmu))
+    goal = (Rotation.from_rotvec([0.0, 0.0, 0.5]) * Rotation.from_quat(first.quat)).as_quat()
+    settings = {
+        "x_des": np.add(first.x, (0.0, 0.05, 0.0)),
+        "quat_des": goal,
+        "Kp_rot": (2.0,) * 3,
+        "Kd_rot": (3.0,) * 3,
+    }
+    twodof.run(fmu, twodof.Bag(tmp_path / "pose"), stop_time=4.0, settings=settings)
+    samples = twodof.samples(fmu, stop_time=4.0, settings=settings)
+    angle = 2.0 * np.arccos([min(1.0, abs(np.dot(sample.quat, goal))) for sample in samples])
+    assert angle[-1] > 0.02 * angle[0] and angle[0] == pytest.approx(0.5)
+    with pytest.raises(AssertionError, match=rf"at 3.3 s its angle from the target orientation is {angle[330]:.3g};"):
+        assert_settles(tmp_path / "pose", within=3.3)
 
 
 def test_a_limit_that_is_exceeded_is_named(tmp_path, native_path):

@@ -21,6 +21,7 @@ from ..files import fits, shown
 from ..notebook import card, picture
 from ..plant.urdf import Urdf
 from ..ros.messages import TRUE_STATES
+from ..simulation.aim import errors
 from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE
 from ..simulation.input_values import Value
 from ..simulation.setup import Setup, robot_of
@@ -209,6 +210,14 @@ class Recording:
         begins, values = self._inputs.table(names)
         # a change has no effect yet at its own communication point
         return values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)]
+
+    def errors(self) -> dict[str, tuple[Array, Array]]:
+        """Return the targets up to each sample and the magnitudes of the errors, m or rad, of "x", "quat" and "q"."""
+        joints = self.held("q_des", self.q.shape[1])
+        targets = {"x": self.target if self.x.size else self.x, "quat": self.target_quat, "q": joints}
+        known = {name: target for name, target in targets.items() if target.size}
+        now = {"x": self.x, "q": self.q, **({"quat": self.setup.orientations(self.q)} if "quat" in known else {})}
+        return {name: (target, errors(name, now[name], target)[1]) for name, target in known.items()}
 
     @property
     def setup(self) -> Setup:

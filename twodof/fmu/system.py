@@ -262,7 +262,8 @@ def _variables(
         start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
         start = start if start is None else _typed(path, source, first, start)
         plain = _is_plain(wiring, source, first, driving & {link.target.element for link in targets})
-        add(str(source) if plain else f"system.{source}", source, replace(first, unit=wiring.unit(source).name or first.unit), causality, start)
+        scalar = replace(first, unit=wiring.unit(source).name or first.unit)
+        add(str(source) if plain else f"system.{source}", source, scalar, causality, start)
     ends = {link.target for link in links}
     names = Counter(name for fmu in fmus.values() for name in fmu.variables)
     for element in (robot, *(name for name in fmus if name != robot)):

@@ -45,11 +45,25 @@ def assert_settles(run: Recording | str | Path, *, within: float) -> None:
         _fail(bag, f"the run cannot settle: {verdict}", [])
     if not settling <= within:
         took = f"settles after {settling:.4g} s" if settling < float("inf") else "does not settle"
-        curves = bag.x - bag.target if bag.target.size and bag.x.size else bag.held("q_des", bag.q.shape[1]) - bag.q
-        error = (curves**2).sum(axis=1) ** 0.5
-        k = min(int(bag.t.searchsorted(within)), len(error) - 1)
-        text = f"the run {took}, but must settle within {within:g} s; at {bag.t[k]:.6g} s its error is {error[k]:.3g}"
-        _fail(bag, f"{text}; {verdict}", [error], "distance from the target")
+        what, error, k = _latest_error(bag, within)
+        text = f"the run {took}, but must settle within {within:g} s; at {bag.t[k]:.6g} s {what} is {error[k]:.3g}"
+        _fail(bag, f"{text}; {verdict}", [error], what.removeprefix("its "))
+
+
+def _latest_error(bag: Recording, within: float) -> tuple[str, Array, int]:
+    """Return the error that is largest relative to its band, a time after the last change of its target.
+
+    The result is its name, its magnitudes, and the index of the sample at that time.
+    """
+    import numpy as np
+
+    found: list[tuple[float, str, Array, int]] = []
+    for name, (target, size) in bag.errors().items():
+        began = int(np.flatnonzero(np.append(True, np.diff(target, axis=0).any(axis=1)))[-1])
+        k = min(int(bag.t.searchsorted(bag.t[began] + within)), len(size) - 1)
+        what = "its angle from the target orientation" if name == "quat" else "its error"
+        found.append((size[k:].max() / (size[began] or np.inf), what, size, k))
+    return max(found, key=lambda each: each[0])[1:]
 
 
 def assert_within_limits(run: Recording | str | Path) -> None:
