@@ -153,6 +153,31 @@ def test_a_constant_that_is_off_by_a_millionth_fails(changed: Changed, file: str
     assert texts and all("the tolerance is 1e-10" in text for text in texts), found
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("Kp[1]", "Kp[2]"),
+        ("Kd[1]", "Kd[2]"),
+        ("xdd_des[1]", "xdd_des[2]"),
+        ("q_meas[1]", "q_meas[2]"),
+        ("v_meas[1]", "v_meas[2]"),
+        ("v_start[1]", "v_start[2]"),
+        ("armature[1]", "armature[2]"),
+        ("payload", "payload_com[1]"),
+    ],
+)
+def test_two_variables_that_are_exchanged_fail(one: str, other: str, built: Path, tmp_path: Path) -> None:
+    files = members(built)
+    text, swapped = files["modelDescription.xml"].decode(), {one: other, other: one}
+    numbers = {name: re.search(rf'name="{re.escape(name)}" valueReference="(\d+)"', text) for name in swapped}
+    for name, of in swapped.items():
+        number = numbers[of]
+        assert number
+        text = re.sub(rf'(name="{re.escape(name)}" valueReference=")\d+', rf"\g<1>{number[1]}", text)
+    changed = packed({**files, "modelDescription.xml": text.encode()}, tmp_path / "swapped.fmu")
+    assert {name: row.outcome for name, row in rows(changed).items()}["reference push"] == "failed"
+
+
 def test_a_compiler_of_another_maker_leaves_it_within_the_tolerance(changed: Changed) -> None:
     """It is the control of the test above: the same procedure with a change that has no effect."""
     found = rows(changed("mechanism.c", "void effort_bounds(|{", NUMBER))

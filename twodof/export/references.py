@@ -1,9 +1,10 @@
 """Reference trajectories in an FMU, with which an importer can be checked.
 
 There are two experiments of 0.5 s from the start position. In "move", the robot follows targets, or efforts of a
-controller. In "push", there are also external efforts. Inputs are constant over HOLD steps, and references are samples
-at which no input changes. Therefore the result does not depend on whether an importer sets inputs before or after it
-reads outputs, or interpolates them.
+controller. In "push", there are also external efforts, rotors, a payload that a controller knows, velocities at the
+start, accelerations of the target, and different gains of the axes. Inputs are constant over HOLD steps, and references
+are samples at which no input changes. Therefore the result does not depend on whether an importer sets inputs before or
+after it reads outputs, or interpolates them.
 
 Each sample is solved twice, by Dormand and Prince's order 8 and by Radau IIA of order 5 (Hairer, Norsett & Wanner,
 "Solving ODEs" I and II), with Pinocchio's equations of motion. Where a closed form exists it is the reference, and both
@@ -43,7 +44,8 @@ IDEAL: dict[str, float | bool] = {
     **{"v_from_q": False, "limit_effort": False, **TIGHT},
 }
 """Parameters with which the motion is smooth, by group."""
-GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau")
+GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau", "q_meas", "v_meas")
+PART = 0.01  # payload and rotors of "push", relative to the robot's inertia
 Columns = dict[str, Array]
 
 
@@ -64,9 +66,11 @@ def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[st
             n: v.start + 1e3 * (-1) ** (v.group == "q_min") for n, v in names.items() if v.group in ("q_min", "q_max")
         }
         plant = Plant(robot, table, control)
-        for key, value in values.items():
-            _set(plant, names[key], value)
-        plant.initialise()
+        for change in (values, _load(plant, names) if name == "push" else {}):
+            values |= change
+            for key, value in change.items():
+                _set(plant, names[key], value)
+            plant.initialise()
         stimuli = _stimuli(plant, names, name == "push")
         found = [_solve(plant, names, stimuli, method, tolerance) for method, tolerance in SOLVERS.items()]
         tolerance, exact = _tolerance(plant, stimuli, found)
@@ -99,6 +103,22 @@ def _set(plant: Plant, variable: Variable, value: float | bool) -> None:
         getattr(plant, variable.group)[variable.index] = value
 
 
+def _load(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool]:
+    """Return a known payload, rotors and velocities at the start, different for each joint, rounded as in the file."""
+    n = len(plant.q)
+    mass, steps = np.diag(plant.known.mass_matrix(np.array(plant.q))), 1.0 + np.arange(n) / n
+    groups = {
+        "payload": PART * sum(inertia.mass for inertia in plant.robot.model.inertias) * np.ones(1),
+        "payload_com": np.array([0.02, -0.01, 0.03]),
+        "armature": PART * mass * steps,
+        "v_start": SWING * (-1.0) ** np.arange(n) * steps,
+    }
+    known = {name: True for name, variable in names.items() if variable.group == "payload_known"}
+    return known | {
+        name: float(f"{groups[v.group][v.index or 0]:.9g}") for name, v in names.items() if v.group in groups
+    }
+
+
 def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns:
     """Return the inputs at each communication point, STEPS + 1 values each, rounded as in the file."""
     n, q, blocks = len(plant.q), np.array(plant.q), STEPS // HOLD
@@ -121,11 +141,15 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns
         mobility = float(np.linalg.norm(J @ np.linalg.solve(mass, J.T), 2)) or 1.0
         inputs["tau_ext"] = ACCELERATION * np.sin(phase) @ mass
         inputs["f_ext"] = ACCELERATION / mobility * np.cos(phase[:, :1] + np.arange(3))
+        inputs["a_des"] = PART * ACCELERATION * np.sin(phase)
+        inputs["xdd_des"] = inputs["alpha_des"] = PART * ACCELERATION * np.sin(phase[:, :1] + np.arange(3))
     columns = {}
     for name, variable in names.items():
         if variable.causality == "input":
             group = inputs.get(variable.group)
             values = np.full(STEPS + 1, variable.start, float) if group is None else group[:, variable.index]
+            if push and variable.group.startswith(("Kp", "Kd")):
+                values *= 1.0 + (variable.index or 0) / 10.0
             columns[name] = np.array([float(f"{value:.9g}") for value in values])
     return columns
 
@@ -139,7 +163,8 @@ def _solve(plant: Plant, names: Mapping[str, Variable], stimuli: Columns, method
     outputs = [v for v in names.values() if v.causality == "output" and v.group in GROUPS]
     rows = np.empty((STEPS + 1, len(outputs)))
     for k in range(STEPS + 1):
-        vectors = {group: getattr(plant, group) for group in {variable.group for variable in outputs}}
+        groups = {variable.group for variable in outputs}
+        vectors = {group: getattr(plant, group.removesuffix("_meas")) for group in groups}
         rows[k] = [vectors[variable.group][variable.index] for variable in outputs]
         for name, column in stimuli.items():
             _set(plant, names[name], float(column[k]))
