@@ -47,22 +47,16 @@ def start_values(trial: Trial) -> str:
     with instantiate_fmu(trial.fmu) as instance:
         instance.begin(trial.start, inf, {})
         _compare_starts(trial, instance, trial.starts, "before it is set")
-        _compare_discrete(trial, instance, "before it is set")
     return f"{len(trial.starts) + len(trial.discrete_starts)} inputs and parameters have their start values"
 
 
-def _compare_starts(trial: Trial, instance: Instance, expected: Mapping[str, float], when: str) -> None:
-    """Raise for a variable that has another value than its start value."""
-    for (name, start), value in zip(expected.items(), instance.reader([*expected])()):
-        if value != start and not (value != value and start != start):
+def _compare_starts(trial: Trial, instance: Instance, reals: Mapping[str, float], when: str) -> None:
+    """Raise for a variable, of reals or of all integers and Booleans, that has another value than its start value."""
+    discrete = {name: instance.value(name) for name in trial.discrete_starts}
+    found = {**dict(zip(reals, instance.reader([*reals])())), **discrete}
+    for name, start in {**reals, **trial.discrete_starts}.items():
+        if (value := found[name]) != start and not (value != value and start != start):
             raise SimulationError(f"{name} is {value!r} {when}, and its start value is {start!r}")
-
-
-def _compare_discrete(trial: Trial, instance: Instance, when: str) -> None:
-    """Raise for an integer or Boolean that has another value than its start value."""
-    for name, start in trial.discrete_starts.items():
-        if (value := instance.value(name)) != start:
-            raise SimulationError(f"{name} is {value} {when}, and its start value is {start}")
 
 
 def reset(trial: Trial) -> str:
@@ -76,7 +70,6 @@ def reset(trial: Trial) -> str:
             trial.rows(instance)
         trial.begin_again(instance)
         _compare_starts(trial, instance, before, "after a reset")
-        _compare_discrete(trial, instance, "after a reset")
         trial.compare(once, trial.rows(instance), "after a reset")
     return "the run after a reset, and after a run with other values, is equal"
 
@@ -120,31 +113,28 @@ def _other_values(trial: Trial, instance: Instance) -> Values:
     return values
 
 
-def _changing_values(trial: Trial) -> tuple[Values, Values]:
-    """Return other values, and the start values, of inputs and parameters that may change between steps."""
-    starts = {**trial.starts, **trial.discrete_starts}
+def _changing_values(trial: Trial) -> Values:
+    """Return other values of inputs and parameters that may change between steps."""
     if {*trial.inputs} >= trial.changing:
-        values: Values = {**trial.changed_inputs()}
-    else:
-        with trial.instance() as instance:
-            values = {n: value for n, value in _other_values(trial, instance).items() if n in trial.changing}
-    return values, {name: starts[name] for name in values if name in starts}
+        return {**trial.changed_inputs()}
+    with trial.instance() as instance:
+        return {name: value for name, value in _other_values(trial, instance).items() if name in trial.changing}
 
 
 def state(trial: Trial) -> str:
     """Save the state, step, restore it and step again."""
     trial.require("canGetAndSetFMUstate")
-    values, starts = _changing_values(trial)
+    values, starts = _changing_values(trial), {**trial.starts, **trial.discrete_starts}
     with trial.instance(values) as instance:
         saved, rows = _saved(trial, instance)
-        instance.set(starts)
+        instance.set({name: starts[name] for name in values if name in starts})
         return _restored(trial, instance, saved, rows)
 
 
 def serialised_state(trial: Trial) -> str:
     """Restore a serialised state in a new instance, after the old one and its state were freed."""
     trial.require("canGetAndSetFMUstate", "canSerializeFMUstate")
-    with trial.instance(_changing_values(trial)[0]) as instance:
+    with trial.instance(_changing_values(trial)) as instance:
         saved, rows = _saved(trial, instance)
         content = bytes(instance.slave.serializeFMUState(saved))
         instance.slave.freeFMUState(saved)
