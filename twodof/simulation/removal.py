@@ -45,9 +45,10 @@ def by_removal(
     if _most(tried) < HALF:
         others = trials.tried(_others(judge, missed, why))
         tried += [cause for cause in others if (cause.removes or 0.0) >= LITTLE]
-    slow = any(cause.kind == "time" for cause in tried)
-    if not slow and max(_most(tried), trials.without_all(tried)) < LITTLE:
-        tried += [cause for cause in trials.tried([*_gains(judge)]) if (cause.removes or 0.0) >= LITTLE]
+    if _most(tried) < HALF:
+        seen = {cause.tried for cause in tried}
+        gains = trials.tried([*_gains(judge)])
+        tried += [cause for cause in gains if (cause.removes or 0.0) >= LITTLE and cause.tried not in seen]
     most = _most(tried)
     if most >= LITTLE or any(map(_is_open, tried)):
         counted = [
