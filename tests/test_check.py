@@ -15,13 +15,14 @@ import fmpy
 import pytest
 from fmpy.model_description import ModelDescription, ModelVariable
 from fmpy.validation import _validate_variable_names
-from systems import component, connection, loop, pd_fmu, ssd
+from systems import component, connection, loop, pd_fmu, ssd, zipped
 from tools import needs
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.fmu import Instance, checking, instantiate, load_any_fmu
+from twodof.fmu.description import problems_of
 from twodof.fmu.trials import TRIALS
 from twodof.fmu.validation import problems_of_names
 
@@ -144,6 +145,28 @@ def test_a_fault_of_an_fmu_at_rest_fails_its_row(fault: str, tmp_path: Path) -> 
     """Its state and its input are 0."""
     row, text = FAULTS[fault]
     assert failed(twodof.check(foreign(tmp_path, fault, x=0.0)))[row].startswith(text)
+
+
+def test_a_state_is_restored_only_if_steps_announce_it(tmp_path: Path) -> None:
+    """FMI 2.0.4, section 4.2.2: with noSetFMUStatePriorToCurrentPoint, an FMU may forget what it would restore."""
+    assert not failed(twodof.check(foreign(tmp_path, "FLUSHES")))
+
+
+def test_an_output_with_an_alias_passes(tmp_path: Path) -> None:
+    """FMI 3.0.1, section 2.4.8: the model structure refers to value references, which an alias shares."""
+    path = twodof.build_fmu(tmp_path / "arm.fmu", twodof.FmuOptions(native=True, fmi=3))
+    assert not problems_of(path)
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    text = files["modelDescription.xml"].decode()
+    found = re.search(r'<Float64 name="q" .*?>', text)
+    assert found
+    end = text.index("</Float64>", found.start())
+    text = f'{text[:end]}<Alias name="angle" displayUnit="deg"/>{text[end:]}'
+    path.write_bytes(zipped({**files, "modelDescription.xml": text.encode()}))
+    assert not problems_of(path)
+    path.write_bytes(zipped({**files, "modelDescription.xml": text.replace("angle", "q").encode()}))
+    assert problems_of(path)
 
 
 def test_derivatives_of_a_large_output_are_compared_within_its_rounding(tmp_path: Path) -> None:

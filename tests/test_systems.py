@@ -257,14 +257,33 @@ def test_a_robot_in_other_units_than_those_of_a_bag_is_refused(plant: bytes, pd:
                 twodof.load_fmu(path)
 
 
-def test_a_connector_gives_a_unit_to_a_robot_without_one(tmp_path: Path) -> None:
+def test_degrees_without_a_base_unit_are_refused(plant: bytes, tmp_path: Path) -> None:
+    with zipfile.ZipFile(io.BytesIO(plant)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    text = re.sub(rb'<Unit name="rad">.*?</Unit>', b'<Unit name="deg"/>', files["modelDescription.xml"], flags=re.S)
+    files["modelDescription.xml"] = text.replace(b'unit="rad"', b'unit="deg"')
+    (tmp_path / "plant.fmu").write_bytes(zipped(files))
+    with pytest.raises(FmuError, match=r"q\[1\] is in deg; a robot needs SI units"):
+        twodof.load_fmu(tmp_path / "plant.fmu")
+
+
+def test_a_setting_of_another_type_than_a_number_or_boolean_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """It would have no effect."""
+    path = loop(tmp_path / "loop.ssp", plant, pd)
+    for name, kind in (("mode", "Enumeration"), ("text", "String")):
+        with pytest.raises(InputError, match=rf"{name} is of type {kind} and cannot be set"):
+            twodof.simulate(path, step=H, stop_time=N * H, settings={f"pd.{name}": 1})
+
+
+@pytest.mark.parametrize("units", [f"<ssd:Units>{DEGREE}</ssd:Units>", ""], ids=["defined", "undefined"])
+def test_a_connector_gives_a_unit_to_a_robot_without_one(units: str, tmp_path: Path) -> None:
     outputs = "".join(
         f'<ScalarVariable name="{name}[1]" valueReference="{k}" causality="output"><Real/></ScalarVariable>'
         for k, name in enumerate("qv", 1)
     )
     robot = described(outputs, '<Outputs><Unknown index="1"/><Unknown index="2"/></Outputs>')
     part = component("plant", connectors({"q[1]": "output deg"}))
-    structure = ssd(f"<ssd:Elements>{part}</ssd:Elements>", f"<ssd:Units>{DEGREE}</ssd:Units>")
+    structure = ssd(f"<ssd:Elements>{part}</ssd:Elements>", units)
     with pytest.raises(FmuError, match=r"plant\.q\[1\] is in deg; a robot needs SI units"):
         twodof.load_fmu(loop(tmp_path / "loop.ssp", robot, robot, structure))
 

@@ -10,14 +10,14 @@ enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES,
        READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
        KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
        RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE, SHARES_PARAMETER,
-       KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER };
+       KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER, FLUSHES };
 #ifndef X
 #define X 1.0
 #endif
 typedef struct { double u, x, p; int phase; double t; int k, b; } M;
 static double shared;
 static int count, living;
-static double shared_p;
+static double shared_p, flushed;
 static char names[8][80];
 static M *owners[8];
 static void start(M *m) { *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0, 0.0, 3, 0}; }
@@ -31,6 +31,7 @@ fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String
                               fmi2Boolean v, fmi2Boolean l) {
     M *m = FAULT == ALONE && living++ ? NULL : malloc(sizeof *m);
     if (m) start(m);
+    flushed = 0.0;
     if (FAULT == NAMED) {  /* a name may not be that of a living instance */
         int k = 0;
         for (int i = 0; i < 8; i++) if (!strcmp(names[i], n)) return NULL;
@@ -90,6 +91,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
     if (FAULT == DISCARDS_LARGE && h > 0.015) return fmi2Discard;
     if (FAULT == ENDS && t + h > 0.1 + 1e-9) return fmi2Discard;
     m->t += h;
+    if (s) flushed = m->t;  /* noSetFMUStatePriorToCurrentPoint */
     m->x += h * (m->u - m->x);
     shared += h * (m->u - shared);
     return fmi2OK;
@@ -97,6 +99,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) { *s = malloc(sizeof(M)); *(M *)*s = *(M *)c; return fmi2OK; }
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
     if (FAULT == CRASHES) abort();
+    if (FAULT == FLUSHES && ((M *)s)->t < flushed) return fmi2Error;
     double u = ((M *)c)->u, p = ((M *)c)->p;
     int k = ((M *)c)->k;
     if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;

@@ -24,7 +24,7 @@ from ..files import read_member, shown
 from ..notebook import card, picture
 from .archives import checksums, open_archive, read_archive
 from .scalar import Scalar, scalars
-from .validation import problems_of_names, problems_of_times, read_description
+from .validation import SCALED, problems_of_names, problems_of_times, read_description
 
 RECORDED = ("q", "v", "x", "xd", "tau", "q_des", "x_des", "quat_des")
 """Vectors of a robot that bags, verdicts and plots contain in SI units."""
@@ -201,6 +201,12 @@ def problems_of(path: Path, inside: str = "") -> list[str]:
         root = ET.fromstring(xml)
         found += problems_of_names(root)
         found += problems_of_times(root)
+        aliases = [(v, alias) for v in root.iterfind("ModelVariables/*") for alias in v.findall("Alias")]
+        if aliases:  # FMPy would look for them in the model structure
+            read_description(root, xml)
+            for variable, alias in aliases:
+                variable.remove(alias)
+            xml = ET.tostring(root)
         read_description(root, xml, validate_model_structure=True)
     except ValidationError as error:
         found += [" ".join(problem.split()) for problem in error.problems]
@@ -226,6 +232,7 @@ def logged(fmu: Fmu) -> Fmu:
         raise FmuError(f"'{fmu.path}' has no outputs q[1], q[2], … and v[1], v[2], … to log{remedy}")
     bases = {unit.name: unit.baseUnit for unit in fmu.description.unitDefinitions if unit.baseUnit is not None}
     scaled = {name for name, base in bases.items() if (base.factor or 1.0, base.offset or 0.0) != (1.0, 0.0)}
+    scaled |= SCALED - bases.keys()
     for name in chain(*map(fmu.vector, RECORDED)):
         if (unit := fmu.variables[name].unit) in scaled:
             raise FmuError(f"'{fmu.path}': {name} is in {unit}; {SI}")

@@ -77,6 +77,7 @@ class Instance:
 
     Attributes:
         slave: FMPy's object, for calls that a run does not use.
+        final: doStep's argument noSetFMUStatePriorToCurrentPoint; false if a state before a step will be restored.
     """
 
     def __init__(self, fmu: Fmu, folder: Path, name: str = "") -> None:
@@ -121,7 +122,8 @@ class Instance:
         self._getters = {"Integer": slave.getInteger, "Boolean": slave.getBoolean}
         self._do_step, self._get = slave.dll["fmi2DoStep"], slave.dll["fmi2GetReal"]
         self._put = slave.dll["fmi2SetReal"]
-        self._rest: tuple[object, ...] = (c_int(1),)
+        self.final: c_int | c_bool = c_int(1)
+        self._rest: tuple[object, ...] = (self.final,)
         return slave
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
@@ -339,7 +341,8 @@ class Instance3(Instance):
         self._getters = {"Integer": slave.getInt32, "Boolean": slave.getBoolean}
         self._do_step, self._get = slave.dll["fmi3DoStep"], slave.dll["fmi3GetFloat64"]
         self._put = slave.dll["fmi3SetFloat64"]
-        self._rest = (c_bool(True), *results)
+        self.final = c_bool(True)
+        self._rest = (self.final, *results)
         return slave
 
     def _set_up(self, **times: float | None) -> None:

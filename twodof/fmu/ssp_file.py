@@ -25,7 +25,7 @@ from fmpy.model_description import DefaultExperiment
 from ..bounds import MAX_COMPONENTS, MAX_DESCRIPTION, MAX_FMUS, MAX_NAME, MIB
 from ..errors import ZIP_ERRORS, FmuError
 from ..files import check_archive, read_member
-from .validation import NUMBERS, TRUE, is_plain_xml
+from .validation import NUMBERS, SCALED, TRUE, is_plain_xml
 
 STRUCTURE = "SystemStructure.ssd"
 SCHEMAS = Path(fmpy.ssp.__file__).parent / "schema"
@@ -49,7 +49,7 @@ class Unit(NamedTuple):
     @property
     def is_scaled(self) -> bool:
         """True if it is not a product of base units."""
-        return self.exponents is not None and (self.factor, self.offset) != (1.0, 0.0)
+        return self.name in SCALED if self.exponents is None else (self.factor, self.offset) != (1.0, 0.0)
 
     @property
     def of_differences(self) -> Unit:

@@ -65,14 +65,11 @@ class Trial:
         inputs = [name for name, v in self.variables.items() if v.causality == "input"]
         self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
 
-        known = [name for name, v in self.variables.items() if v.causality in ("input", "parameter")]
-        values = ((name, fmu.variables[name].start_value) for name in known)
-        self.starts = {name: value for name, value in values if value is not None}
-        discrete = [v for v in fmu.variables.values() if v.type in ("Integer", "Boolean")]
-        values = ((v.name, v.start_value) for v in discrete if v.causality in ("input", "parameter"))
-        self.discrete_starts = {name: value for name, value in values if value is not None}
-        given = (fmu.variables[name] for name in (*self.starts, *self.discrete_starts))
-        self.changing = {v.name for v in given if v.causality == "input" or v.variability == "tunable"}
+        given = [v for v in fmu.variables.values() if v.causality in ("input", "parameter")]
+        starts = {v: value for v in given if (value := v.start_value) is not None}
+        self.starts = {v.name: value for v, value in starts.items() if v.type == "Real"}
+        self.discrete_starts = {v.name: value for v, value in starts.items() if v.type != "Real"}
+        self.changing = {v.name for v in starts if v.causality == "input" or v.variability == "tunable"}
 
     def changed_inputs(self) -> dict[str, float]:
         """Return values of the inputs that differ from their start values, so that an FMU at rest moves."""
@@ -90,13 +87,9 @@ class Trial:
     def changed_discrete(self) -> dict[str, float | bool]:
         """Return values of integers and Booleans that differ from their start values."""
         most = {v.valueReference: int(v.max or LARGEST) for v in self.about.modelVariables if v.type in INTEGERS}
-
-        def other(name: str, start: float | bool) -> float | bool:
-            if isinstance(start, bool):
-                return not start
-            return start - 1 if start == most[self.fmu.variables[name].reference] else start + 1
-
-        return {name: other(name, start) for name, start in self.discrete_starts.items()}
+        top = {name: most.get(self.fmu.variables[name].reference) for name in self.discrete_starts}
+        changes = ((name, start, -1 if start == top[name] else 1) for name, start in self.discrete_starts.items())
+        return {name: not start if isinstance(start, bool) else start + change for name, start, change in changes}
 
     def require(self, *claims: str) -> None:
         """End a trial of a feature that the description does not claim."""

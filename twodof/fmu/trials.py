@@ -149,6 +149,7 @@ def _saved(trial: Trial, instance: Instance) -> tuple[Any, list[Outputs]]:
     trial.rows(instance, half)
     trial.note("saving the state")
     saved, before = instance.slave.getFMUState(), trial.reader(instance)()
+    instance.final.value = False
     return saved, [before, *trial.rows(instance, half, half)]
 
 

@@ -22,6 +22,8 @@ NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Bo
 """Supported types of variables, and functions that parse their start values."""
 TIMES = {"startTime": 0.0, "stopTime": math.inf, "stepSize": 1.0}
 """Times of a default experiment, and values for those that it does not state."""
+SCALED = {"deg", "degree", "°", "deg/s", "rpm", "mm", "mm/s", "cm", "N.mm"}
+"""Names of units that are no SI units even if the description does not define them."""
 RELATIVE = "relativeQuantity"
 OF_TYPES = (RELATIVE, "quantity", "unit", "displayUnit", "min", "max", "nominal")
 """Attributes whose defaults are those of the declared type: FMI 2.0.4, section 2.2.7."""
