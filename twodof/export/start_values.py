@@ -83,6 +83,8 @@ def _checked(fmu: Variables, name: str, value: object) -> Value:
         if not isinstance(value, bool):
             raise InputError(f"{name} = {value!r}: expected true or false")
         return value
+    if variable.type not in ("Real", "Integer"):
+        raise InputError(f"{name} is of type {variable.type} and cannot be set; Float64, Int32 and Boolean can")
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name} = {value!r}: expected a number")
     try:
