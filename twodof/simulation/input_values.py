@@ -1,8 +1,9 @@
 """Settings of a run: values by name, and CSV files of inputs over time, checked against an FMU."""
 
 import csv
+from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from math import isfinite
 from pathlib import Path
 
@@ -12,12 +13,18 @@ from ..files import check_file
 from ..fmu import Fmu, no_variable
 from ..fmu import Setting as Setting
 from ..fmu import resolve as resolve
-from ..plant.numerals import number
+from ..plant.numerals import number, whole_number
 from ..plant.variables import GAINS
 from ..plant.variables import Value as Value
 
 Changes = list[tuple[float, dict[str, Value]]]
 """Ascending times, s, and the new values of inputs at these times."""
+KINDS: dict[str, tuple[Callable[[str], Value], str]] = {
+    "Real": (number, "a number"),
+    "Integer": (lambda cell: array("i", [whole_number(cell)])[0], "a whole number of 32 bits"),
+    "Boolean": ({"true": True, "false": False}.__getitem__, "true or false"),
+}
+"""Functions that read the cells of a type, and what they expect."""
 
 
 def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
@@ -56,16 +63,18 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     twice = next((element for element, n in Counter(columns).items() if n > 1), None)
     if twice is not None:
         raise InputError(f"'{path}' has two columns for '{twice:.50}'")
+    kinds = {name: KINDS[fmu.variables[own[0]].type] for name, own in elements.items()} | {"time": KINDS["Real"]}
     changes: Changes = []
     for line, row in rows:
         if len(row) != len(header):
             raise InputError(f"'{path}' row {line}: {len(row)} cells, expected {len(header)}")
         values: dict[str, Value] = {}
         for name, cell in zip(header, row, strict=True):
+            read, expected = kinds[name]
             try:
-                values[name] = number(cell)
-            except ValueError:
-                raise InputError(f"'{path}' row {line}: {name} = '{cell:.50}' is not a number") from None
+                values[name] = read(cell.strip())
+            except (ValueError, LookupError, OverflowError):
+                raise InputError(f"'{path}' row {line}: {name} = '{cell:.50}' is not {expected}") from None
             if not isfinite(values[name]):
                 raise InputError(f"'{path}' row {line}: {name} = {cell:.50} is not finite")
         time = values.pop("time")
@@ -97,8 +106,9 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
     elements = [name] if name in fmu.variables else fmu.vector(name)
     if not elements:
         raise InputError(f"'{path}': {no_variable(fmu, name, 'input')}")
-    if any(fmu.variables[element].causality != "input" for element in elements):
-        raise InputError(f"'{path}': {name} is not an input")
+    variables = [fmu.variables[element] for element in elements]
+    if any(variable.causality != "input" or variable.type not in KINDS for variable in variables):
+        raise InputError(f"'{path}': {name} is not an input of a number or Boolean")
     return elements
 
 
