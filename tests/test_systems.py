@@ -267,6 +267,28 @@ def test_degrees_without_a_base_unit_are_refused(plant: bytes, tmp_path: Path) -
         twodof.load_fmu(tmp_path / "plant.fmu")
 
 
+def test_a_table_sets_whole_numbers_and_booleans(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """The output "steps" of native/pd.c counts, and its input "enabled" switches the effort off."""
+    path, table = loop(tmp_path / "loop.ssp", plant, pd), tmp_path / "in.csv"
+    settings = {**GAINS, "pd.q_des": TARGET}
+    table.write_text(f"time,pd.enabled,pd.seen\n0,true,1\n{20 * H},false,2\n")
+    given = [sample.q for sample in twodof.samples(path, step=H, stop_time=N * H, settings=settings, input_file=table)]
+    with closing(twodof.samples(path, step=H, stop_time=N * H, settings=settings)) as run:
+        rows = [next(run).q]
+        while len(rows) <= N:
+            rows.append(run.send({"pd.enabled": False} if len(rows) == 21 else {}).q)
+    np.testing.assert_array_equal(given, rows)
+    for column, cell, text in (
+        ("enabled", "1", "row 2: pd.enabled = '1' is not true or false"),
+        ("seen", "4294967299", "row 2: pd.seen = '4294967299' is not a whole number of 32 bits"),
+        ("seen", "1.5", "row 2: pd.seen = '1.5' is not a whole number of 32 bits"),
+        ("mode", "1", "pd.mode is not an input of a number or Boolean"),
+    ):
+        table.write_text(f"time,pd.{column}\n0,{cell}\n")
+        with pytest.raises(InputError, match=re.escape(text)):
+            twodof.experiment(path, input_file=table)
+
+
 def test_a_setting_of_another_type_than_a_number_or_boolean_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     """It would have no effect."""
     path = loop(tmp_path / "loop.ssp", plant, pd)
@@ -311,24 +333,26 @@ def test_only_a_target_in_si_units_that_drives_the_robot_is_its_target(plant: by
 
 
 @pytest.mark.parametrize(
-    ("unit", "wires", "name"),
+    ("unit", "factor", "wires", "name"),
     [
-        ("rad", WIRES, "q_des"),
-        ("deg", WIRES, "system.q_des"),
-        ("rad", connection("plant.q[1]", "pd.q[1]"), "system.q_des"),
+        ("rad", 1.0, WIRES, "q_des"),
+        ("deg", 1.0, WIRES, "system.q_des"),
+        ("rad", 2.0, WIRES, "system.q_des"),
+        ("rad", 1.0, connection("plant.q[1]", "pd.q[1]"), "system.q_des"),
     ],
 )
 def test_a_connector_is_the_target_only_in_si_units_if_it_drives_the_robot(
-    unit: str, wires: str, name: str, plant: bytes, pd: bytes, tmp_path: Path
+    unit: str, factor: float, wires: str, name: str, plant: bytes, pd: bytes, tmp_path: Path
 ) -> None:
     ports = connectors({f"q_des[{i}]": f"input {unit}" for i in (1, 2)})
     plain = loop(tmp_path / "plain.ssp", plant, pd, ssd(f"{BOTH}<ssd:Connections>{wires}</ssd:Connections>"))
-    wires += "".join(connection(f"q_des[{i}]", f"pd.q_des[{i}]") for i in (1, 2))
+    scaled = f'<ssc:LinearTransformation factor="{factor}"/>' if factor != 1.0 else ""
+    wires += "".join(connection(f"q_des[{i}]", f"pd.q_des[{i}]", scaled) for i in (1, 2))
     structure = ssd(f"{ports}{BOTH}<ssd:Connections>{wires}</ssd:Connections>", f"<ssd:Units>{DEGREE}</ssd:Units>")
     path = loop(tmp_path / "loop.ssp", plant, pd, structure)
     system = twodof.load_fmu(path)
     assert {*system.groups("input")} >= {name} and bool(system.vector("q_des")) == (name == "q_des")
-    goal, gains = {name: np.rad2deg(TARGET) if unit == "deg" else TARGET}, dict(pd__Kp=0.1, pd__Kd=0.01)
+    goal, gains = {name: (np.rad2deg(TARGET) if unit == "deg" else TARGET) / factor}, dict(pd__Kp=0.1, pd__Kd=0.01)
     expected = q_of(plain, **gains, pd__q_des=TARGET)
     np.testing.assert_allclose(q_of(path, **gains, **goal), expected, rtol=0.0, atol=1e-14)
     assert (twodof.run(path, step=H, stop_time=N * H).verdict.outcome != "no target") == (name == "q_des")

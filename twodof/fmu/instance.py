@@ -200,15 +200,12 @@ class Instance:
                 self._refuse(status)
             return whole
 
-        if whole is values:
-            return read
-
         def read_elements() -> Values:
             read()
             values[:] = [whole[column] for column in columns]
             return values
 
-        return read_elements
+        return read if whole is values else read_elements
 
     def writer(self, names: Sequence[str], values: Values) -> Callable[[], None]:
         """Return a function that sets Real variables to the values in a buffer.

@@ -247,11 +247,9 @@ def _variables(
 
     driving = _driving(links, robot)
     driven: dict[Node, list[Link]] = {}
-    for link in links:
+    for link in (link for link in links if link.source.element not in fmus):
         driven.setdefault(link.source, []).append(link)
     for source, targets in driven.items():
-        if source.element in fmus:
-            continue
         scalars = [scalar for link in targets if (scalar := wiring.scalar(link.target)) is not None]
         first = scalars[0]
         if len(types := sorted({scalar.type for scalar in scalars})) > 1:
@@ -261,7 +259,8 @@ def _variables(
         inverted = {value if value is None else link.map.inverse(value) for link, value in zip(targets, values)}
         start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
         start = start if start is None else _typed(path, source, first, start)
-        plain = _is_plain(wiring, source, first, driving & {link.target.element for link in targets})
+        same = [link.target for link in targets if link.map == IDENTITY or wiring.unit(link.target).is_scaled]
+        plain = _is_plain(wiring, source, first, driving & {target.element for target in same})
         scalar = replace(first, unit=wiring.unit(source).name or first.unit)
         add(str(source) if plain else f"system.{source}", source, scalar, causality, start)
     ends = {link.target for link in links}
@@ -284,10 +283,7 @@ def _variables(
 
 
 def _is_plain(wiring: Wiring, node: Node, scalar: Scalar, driving: set[str]) -> bool:
-    """Return whether an input's name without a component cannot be mistaken for a vector of the robot.
-
-    Targets have the names of the robot's, if they are in SI units and drive the robot, through some components.
-    """
+    """Return whether an input has no name of the robot's vectors, or is a target in SI units that drives the robot."""
     group = node.connector.partition("[")[0]
     target = group.endswith("_des") and bool(driving) and scalar.type == "Real"
     return group not in RECORDED or (target and not wiring.unit(node).is_scaled)

@@ -16,8 +16,6 @@ from .system_instance import instantiate_fmu
 
 STEPS = 20
 DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
-INTEGERS = ("Integer", "Int32")
-LARGEST = 2**31 - 1
 Outputs = tuple[float, ...]
 
 
@@ -86,10 +84,10 @@ class Trial:
 
     def changed_discrete(self) -> dict[str, float | bool]:
         """Return values of integers and Booleans that differ from their start values."""
-        most = {v.valueReference: int(v.max or LARGEST) for v in self.about.modelVariables if v.type in INTEGERS}
-        top = {name: most.get(self.fmu.variables[name].reference) for name in self.discrete_starts}
-        changes = ((name, start, -1 if start == top[name] else 1) for name, start in self.discrete_starts.items())
-        return {name: not start if isinstance(start, bool) else start + change for name, start, change in changes}
+        return {
+            name: not start if isinstance(start, bool) else start - 1 if start > 1 else start + 1
+            for name, start in self.discrete_starts.items()
+        }
 
     def require(self, *claims: str) -> None:
         """End a trial of a feature that the description does not claim."""

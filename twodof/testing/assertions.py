@@ -51,10 +51,7 @@ def assert_settles(run: Recording | str | Path, *, within: float) -> None:
 
 
 def _latest_error(bag: Recording, within: float) -> tuple[str, Array, int]:
-    """Return the error that is largest relative to its band, a time after the last change of its target.
-
-    The result is its name, its magnitudes, and the index of the sample at that time.
-    """
+    """Return name, magnitudes and sample of the error that is largest for its band, a time after its target changed."""
     import numpy as np
 
     found: list[tuple[float, str, Array, int]] = []
