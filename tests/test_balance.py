@@ -73,7 +73,7 @@ FIRST = [
     ("task", {"Kp": 5.0, "damping": 0.05}, 5.0, "still approaches"),
     ("task", {"tau_ext": (0.0, 0.3)}, 5.0, "does not know tau_ext = (0, 0.3)"),
     ("joint", {**AWAY, "q_max": (0.6, 3.0), "tau_ext": (0.2, 0.0)}, 5.0, "'joint1' is out of reach by 0.3 rad"),
-    ("task", {"x_des": (1.0, 0.05), "payload": 0.3}, 5.0, "the target is out of reach by"),
+    ("task", {"x_des": (0.6, 0.05), "payload": 0.1}, 5.0, "the target is out of reach by"),
     ("joint", {**AWAY, "Kp": 0.0, "Kd": 50.0, "control_period": 0.02}, 5.0, "Kp = 0: the controller"),
     ("joint", {**AWAY, "q_max": (3.0, 0.7848), "control_period": 0.01, "q_resolution": 0.0186}, 5.0, "out of reach by"),
     ("task", {"x_des": (0.368, 0.05), "Kp": 1.29, "Kd": 20.0}, 5.0, "and other causes keep an error"),
