@@ -46,6 +46,14 @@ def test_text_computes_the_expression_and_how_it_varies():
         assert np.imag(scope["z"]) == pytest.approx(np.imag(f(*arguments)), rel=1e-12)
 
 
+def test_code_has_the_order_in_which_expressions_were_created():
+    """Code of one body stays together, whatever the results are that use it."""
+    x, y = Expression("x"), Expression("y")
+    first, second = x + y, x - y
+    text = c_function("void f(double x, double y, double z[2])", {"z[0]": second * second, "z[1]": first * first})
+    assert text.index("x + y") < text.index("x - y")
+
+
 def test_calls_of_the_generator_grow_with_the_joints_alone():
     def calls(joints: int) -> int:
         robot = load_robot(chain_urdf("zy" * (joints // 2)), "tip", "xyz")
