@@ -216,9 +216,9 @@ static double first_release(Step *step, double before)
         doubt |= step->stops.watched[i] && may_be_released(step, i);
     if (!doubt)
         return HUGE_VAL;
-    const double instant = TIME_RESOLUTION * step->size;
-    const double at_once = release_margin(step, instant, 0);
-    if (at_once < 0.0 && at_once < -fabs(release_margin(step, 0.0, 0) - least_grip(step, step->effort[0])))
+    const double instant = TIME_RESOLUTION * step->size, at_start = least_grip(step, step->effort[0]);
+    const double at_once = at_start > 4.0 * step->rounding ? at_start : release_margin(step, instant, 0);
+    if (at_once < 0.0 && at_once < -fabs(release_margin(step, 0.0, 0) - at_start))
         return instant; /* beyond the difference of two ways to compute the efforts; else the joint would be held again */
     memcpy(effort[0], step->effort[0], sizeof *effort);
     memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
