@@ -5,6 +5,13 @@
 #include "internal.h"
 #include "mechanism.h"
 
+/* True if the law depends on the task frame. */
+#ifdef HAS_RCOND
+enum { NEEDS_POSITIONS = 1 };
+#else
+enum { NEEDS_POSITIONS = 0 };
+#endif
+
 /* The law at a state with inputs held: accelerations q̈_cmd if COMMANDS_ACCELERATION is defined, otherwise efforts τ.
    Rank and margin are those of apply_pseudo_inverse; they are 0 and 1 for a law without J⁺. The margin may be NULL. */
 INTERNAL int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],

@@ -61,7 +61,8 @@ static void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], d
         return;
     }
     acceleration(step->plant, y, v, slip_of(stops), stops->rank, a, margin);
-    restrain(step->plant, stops, y, a, effort);
+    if (stops->any_held)
+        restrain(step->plant, stops, y, a, effort);
 }
 
 /* Root mean square of error/tolerance. */

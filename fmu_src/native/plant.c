@@ -150,6 +150,18 @@ static int find_excess(const double value[N_VARIABLES], const JointPosition join
     return rank;
 }
 
+/* True if nothing acts but τ of a law that knows all: within effort limits, the commanded acceleration is the motion. */
+static int acts_alone(const double value[N_VARIABLES], const int slip[N_JOINTS])
+{
+    const double *force = &value[F_EXT];
+    if (slip || !knows_all(value) || force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0)
+        return 0;
+    for (int i = 0; i < N_JOINTS; i++)
+        if (value[TAU_EXT + i] != 0.0 || value[DAMPING + i] != 0.0)
+            return 0;
+    return 1;
+}
+
 /* q̈ by the equations of motion at a state, with the given rank of J⁺. Joints slip in the given directions (−1, 1; 0 or
    NULL: no friction), and joints at rest are free. Returns the rank. The margin, which may be NULL, is negative if the
    singular values give another rank. */
@@ -158,15 +170,26 @@ INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const do
 {
     JointPosition joint[N_BODIES];
     double excess[N_JOINTS], further[N_JOINTS];
+    const double *value = plant->value;
+    const int alone = acts_alone(value, slip), limited = value[LIMIT_EFFORT] != 0.0;
     int acts = 0;
-    place_joints(q, joint);
-    rank = find_excess(plant->value, joint, q, v, slip, rank, a, excess, margin);
+    if (NEEDS_POSITIONS || limited || !alone)
+        place_joints(q, joint);
+    if (alone) {
+        rank = command(value, joint, q, v, rank, a, margin);
+        if (!limited || !may_saturate(value, joint, v, a))
+            return rank;
+        memset(excess, 0, sizeof excess);
+        add_excess(value, joint, v, a, a, excess);
+    } else {
+        rank = find_excess(value, joint, q, v, slip, rank, a, excess, margin);
+    }
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
         EndBody end_body;
-        body(plant->value, 0, &end_body);
-        acceleration_of_effort(joint, &end_body, &plant->value[ARMATURE], excess, further);
+        body(value, 0, &end_body);
+        acceleration_of_effort(joint, &end_body, &value[ARMATURE], excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
