@@ -36,7 +36,7 @@ from bags import (
 )
 
 import twodof
-from twodof.bag import joint_states, reader
+from twodof.bag import joint_states, reader, sqlite
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.records import DamageError, ReadBudget
@@ -104,6 +104,7 @@ def test_mcap_of_more_topics_than_are_read_is_refused(bag, capsys):
 COUNT = "WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c)"
 TOPICS = "(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT"
 MESSAGES = "(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+VIEW = f"CREATE VIEW messages AS {COUNT} SELECT n AS id, 1 AS topic_id, n AS timestamp, 1 AS data FROM c"
 DATABASES = {
     "a view of messages": (
         "DROP TABLE messages;"
@@ -135,6 +136,14 @@ DATABASES = {
     "a view whose statement is bytes": (
         "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'view', rootpage = 0, sql ="
         f" CAST('CREATE VIEW messages AS {COUNT} SELECT n AS id FROM c' AS BLOB) WHERE name = 'messages'",
+        "has views, triggers or virtual tables",
+    ),
+    "a view behind an index of the schema with other rows": (
+        "DROP TABLE messages; CREATE TABLE other (name, sql); CREATE INDEX others ON other (name, sql);"
+        "INSERT INTO other VALUES ('topics', 'CREATE TABLE a (b)'), ('messages', 'CREATE TABLE a (b)');"
+        "PRAGMA writable_schema = ON; UPDATE sqlite_master SET name = 'of_schema', tbl_name = 'sqlite_master',"
+        " sql = 'CREATE INDEX of_schema ON sqlite_master (name, sql)' WHERE name = 'others';"
+        f"INSERT INTO sqlite_master VALUES ('view', 'messages', 'messages', 0, '{VIEW}')",
         "has views, triggers or virtual tables",
     ),
     "messages that are computed": (
@@ -183,6 +192,22 @@ DATABASES = {
 @pytest.mark.parametrize(("script", "reason"), DATABASES.values(), ids=DATABASES)
 def test_hostile_database_is_refused(bag, script, reason, capsys):
     """It is a database of rosbag2, changed by some statements."""
+    make_database(bag, script)
+    assert reason in refused(capsys, bag)
+    assert sorted(bag.parent.rglob("*")) == [bag, bag / "bag.db3", bag / "metadata.yaml"]
+
+
+def test_a_view_that_is_found_late_is_not_read_without_end(bag, monkeypatch, capsys):
+    """Each defence works without those before it; the view has no rows, and never ends."""
+    make_database(bag, f"DROP TABLE messages; {VIEW} WHERE n < 0")
+    assert "has views" in refused(capsys, bag)
+    monkeypatch.setattr(sqlite, "PLAIN", ("CREATE ",))
+    assert "not authorized" in refused(capsys, bag)
+    monkeypatch.setattr(sqlite, "_authorize", lambda *_: sqlite3.SQLITE_OK)
+    assert "interrupted" in refused(capsys, bag)
+
+
+def make_database(bag: Path, script: str) -> None:
     with sqlite3.connect(bag / "bag.db3") as database:
         database.executescript(
             f"BEGIN; CREATE TABLE topics {TOPICS}, offered_qos_profiles TEXT);"
@@ -190,8 +215,6 @@ def test_hostile_database_is_refused(bag, script, reason, capsys):
             f"INSERT INTO topics VALUES (1, '/joint_states', '{JOINT_STATE}', 'cdr', '');"
             f"{script};COMMIT"
         )
-    assert reason in refused(capsys, bag)
-    assert sorted(bag.parent.rglob("*")) == [bag, bag / "bag.db3", bag / "metadata.yaml"]
 
 
 # --- small files of much ---

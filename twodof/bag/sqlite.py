@@ -6,7 +6,7 @@ import sqlite3
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from itertools import groupby, islice
+from itertools import count, groupby, islice
 from operator import length_hint
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ TABLES = {  # ROS 2's tables and their columns; older versions lack the last one
     "message_definitions": "id topic_type encoding encoded_message_definition",
     "messages": "id topic_id timestamp data",
 }
-SCHEMA_STEPS = 1000  # instructions of SQLite's virtual machine
+READABLE = {*TABLES, "sqlite_master"}
+STEPS = 1000  # instructions of SQLite's virtual machine: all for the schema, and one for each byte of the rows
 MOST_LOST = 16  # size that a database states to that of its files, which a crash may have shortened
 SOME, SOME_BYTES = 1000, 16 * MIB  # rows in a group, and their size from which it ends
 
@@ -76,15 +77,23 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
                         journal.write(bytes(8))
             uri = (folder / path.name).as_uri()
         with closing(sqlite3.connect(uri, uri=True)) as database:
+            database.set_authorizer(_authorize)
             database.execute("PRAGMA writable_schema = ON")  # reads files that lack their end
-            database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
-            schema = [*database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL")]
-            database.set_progress_handler(None, 0)
+            database.set_progress_handler(lambda: 1, STEPS)
+            # a file can have an index of its schema with other rows
+            schema = [*database.execute("SELECT name, sql FROM sqlite_master NOT INDEXED WHERE sql NOT NULL")]
             if not {name for name, _ in schema} >= {"topics", "messages"}:
                 raise DamageError(f"'{path.name}' has no messages")
             if not all(isinstance(sql, str) and sql.startswith(PLAIN) for _, sql in schema):  # names may repeat
                 raise DamageError(f"'{path.name}' has views, triggers or virtual tables")
             yield database
+
+
+def _authorize(action: int, table: str | None, _: str | None, __: str | None, view: str | None) -> int:
+    """Return whether a statement may do this: only read tables of ROS 2 and the schema, and through no view."""
+    readable = action == sqlite3.SQLITE_READ and table in READABLE
+    allowed = readable or action in (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_PRAGMA)
+    return sqlite3.SQLITE_OK if allowed and view is None else sqlite3.SQLITE_DENY
 
 
 def _unfinished(path: Path) -> list[Path]:
@@ -114,7 +123,7 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
     columns = TABLES[table].split()
     infos = database.execute(f"PRAGMA table_xinfo({table})")
     stored = ["" if computed else name for _, name, *_, computed in infos]
-    listed = database.execute("SELECT 1 FROM sqlite_master WHERE name = ?", [table])
+    listed = database.execute("SELECT 1 FROM sqlite_master NOT INDEXED WHERE name = ?", [table])
     if not stored and listed.fetchone():
         raise DamageError(f"'{path.name}' is damaged")  # its columns cannot be read
     known = [name for name in columns if name in stored]
@@ -128,6 +137,8 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
         (pages,), (size,) = (database.execute(f"PRAGMA page_{what}").fetchone() for what in ("count", "size"))
         if pages * size > max(SOME_BYTES, MOST_LOST * room):
             raise DamageError(f"'{path.name}' is damaged")
+    steps, most = count(), room // STEPS
+    database.set_progress_handler(lambda: next(steps) > most, STEPS)
     for row in database.execute(f"SELECT {names} FROM {table} NOT INDEXED") if stored else ():
         room -= len(known) + sum(map(length_hint, row))
         if room < 0:
