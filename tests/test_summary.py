@@ -56,6 +56,12 @@ def ends(bag: Path) -> list[object]:
     return [recording.count, recording.joints, recording.topics, *(part.tolist() for part in parts)]
 
 
+def seal(file: Path, content: bytearray, start: int) -> None:
+    """Write a file whose summary was changed, with a valid checksum."""
+    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
+    file.write_bytes(content)
+
+
 def without_checksum(file: Path) -> None:
     content = file.read_bytes()
     file.write_bytes(content[:-12] + bytes(4) + content[-8:])
@@ -118,8 +124,7 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
     content = bytearray(file.read_bytes())
     start, place = statistics_of(content)
     content[place + 9 + field] ^= 1
-    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
-    file.write_bytes(content)
+    seal(file, content, start)
     assert read_summary(file) is None
 
 
@@ -132,31 +137,74 @@ def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(ba
     while content[place] != CHANNEL:
         place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
     content[place + 9] ^= 0xFF
-    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
-    file.write_bytes(content)
+    seal(file, content, start)
     assert read_summary(file) is None
 
 
-@pytest.mark.parametrize("whose", ["metadata.yaml", "summary"])
-def test_a_summary_that_contradicts_metadata_is_reported_and_repaired(bag, whose, capsys, caplog):
-    """Either may be wrong: the file has 12,006 messages."""
-    if whose == "summary":
-        file = file_of(bag)
-        content = bytearray(file.read_bytes())
-        start, place = statistics_of(content)
-        for at in (place + 9, place + 9 + 46 + 2):  # of all messages, and of the first channel
-            struct.pack_into("<Q", content, at, struct.unpack_from("<Q", content, at)[0] - 1)
-        content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
-        file.write_bytes(content)
-        stated, held = 12_006, 12_005
-    else:
-        yaml = bag / whose
-        text = yaml.read_text("utf-8")
-        yaml.write_text(text.replace("message_count: 12006", "message_count: 12007"), "utf-8")
-        stated, held = 12_007, 12_006
+def test_counts_that_the_index_contradicts_are_not_believed(bag, capsys, caplog):
+    """The checksum is valid, and the statistics lack a message; the file has 12,006."""
+    file = file_of(bag)
+    content = bytearray(file.read_bytes())
+    start, place = statistics_of(content)
+    for at in (place + 9, place + 9 + 46 + 2):  # of all messages, and of the first channel
+        struct.pack_into("<Q", content, at, struct.unpack_from("<Q", content, at)[0] - 1)
+    seal(file, content, start)
+    assert read_summary(file) is None
+    assert main(["info", str(bag)]) == 0
+    assert not caplog.messages
+    assert "3001 joint states" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_chunk_is_named_once(bag, times):
+    """The checksum is valid, and index and statistics have a chunk twice."""
+    file = file_of(bag)
+    content = bytearray(file.read_bytes())
+    start, _ = statistics_of(content)
+    summary = read_summary(file)
+    assert summary is not None
+    chunk = start
+    while content[chunk] != 8:
+        chunk += 9 + struct.unpack_from("<Q", content, chunk + 1)[0]
+    size = 9 + struct.unpack_from("<Q", content, chunk + 1)[0]
+    content[chunk:chunk] = content[chunk : chunk + size] * (times - 1)
+    _, place = statistics_of(content)
+    added = {number: count * (times - 1) for number, count in summary.chunks[0].counts.items()}
+    stated, *fields = struct.unpack_from("<QHIII", content, place + 9)
+    struct.pack_into("<QHIII", content, place + 9, stated + sum(added.values()), *fields)
+    struct.pack_into("<I", content, place + 9 + 22, len(summary.chunks) + times - 1)
+    for at in range(place + 9 + 46, place + 9 + struct.unpack_from("<Q", content, place + 1)[0], 10):
+        number, count = struct.unpack_from("<HQ", content, at)
+        struct.pack_into("<Q", content, at + 2, count + added.get(number, 0))
+    seal(file, content, start)
+    assert (read_summary(file) is None) == (times > 1)
+    assert ends(bag)[0] == 3001
+
+
+def test_a_chunk_with_fewer_messages_than_its_index_is_refused(bag):
+    """The checksum is valid; the last chunk is empty, and its index has the old messages."""
+    file = file_of(bag)
+    content = bytearray(file.read_bytes())
+    summary = read_summary(file)
+    assert summary is not None
+    last = summary.chunks[-1]
+    place = last.offset + 9 + 32 + 8
+    while place < last.offset + last.length:  # messages become records of another kind
+        content[place] = 200
+        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
+    file.write_bytes(content)
+    with pytest.raises(twodof.TwoDofError, match="has 0 messages on /joint_states at byte"):
+        read_ends(bag)
+
+
+def test_a_file_that_contradicts_metadata_is_reported_and_repaired(bag, capsys, caplog):
+    """The file has 12,006 messages."""
+    yaml = bag / "metadata.yaml"
+    text = yaml.read_text("utf-8")
+    yaml.write_text(text.replace("message_count: 12006", "message_count: 12007"), "utf-8")
     assert main(["info", str(bag)]) == 0
     (line,) = caplog.messages
-    assert f"has {stated} messages according to its metadata.yaml, and {held} in" in line
+    assert "has 12007 messages according to its metadata.yaml, and 12006 in" in line
     assert f"'twodof recover {bag}'" in line
     assert main(["recover", str(bag)]) == 0
     caplog.clear()
@@ -191,8 +239,7 @@ def test_a_summary_with_another_name_of_a_topic_is_refused(tmp_path):
     content = bytearray(file.read_bytes())
     start, _ = statistics_of(content)
     content[start:] = content[start:].replace(b"/joint_states", b"/joint_statex")
-    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
-    file.write_bytes(content)
+    seal(file, content, start)
     with pytest.raises(twodof.TwoDofError, match="has two topics of the number 1"):
         read_ends(file.parent)
 
@@ -219,9 +266,8 @@ def test_messages_that_the_summary_alone_has_are_missed(tmp_path):
             struct.pack_into("<H", content, place + 9 + number_at, 2)
         place += 9 + length
     content[start:] = content[start:].replace(b"/joint_states", b"/joint_statex")
-    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
-    file.write_bytes(content)
-    with pytest.raises(twodof.TwoDofError, match="no messages on /joint_statex, which its summary counts"):
+    seal(file, content, start)
+    with pytest.raises(twodof.TwoDofError, match="has 0 messages on /joint_statex at byte"):
         read_ends(file.parent)
 
 

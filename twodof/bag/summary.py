@@ -9,9 +9,12 @@ Source: MCAP's specification. A file without a summary, or without its checksum,
 """
 
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 from zlib import crc32
 
 from ..bounds import MAX_SUMMARY
@@ -22,18 +25,20 @@ CHUNK_INDEX, STATISTICS = 8, 11  # opcodes
 FOOTER_FIELDS = struct.Struct("<QQI")
 END = HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
-CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the rest
+CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the offsets by channel
+INDEX_SIZE = struct.Struct("<Q")  # of all message indexes of a chunk, which follow it
+INDEX_HEAD, INDEX_ENTRY = 15, 16  # bytes of a message index of one channel, besides those of each message
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """Log times in ns, offset and length of a chunk's record, and its channels."""
+class Chunk(NamedTuple):
+    """Log times in ns, offset and length of a chunk's record, end of its message indexes, and its message counts."""
 
     first: int
     last: int
     offset: int
     length: int
-    channels: frozenset[int]
+    end: int
+    counts: dict[int, int]
 
 
 @dataclass(frozen=True)
@@ -52,26 +57,25 @@ class McapSummary:
             DamageError: a chunk is damaged, or not at its stated offset.
             OSError: the file cannot be read.
         """
-        numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
-        chunks = [chunk for chunk in self.chunks if chunk.channels & numbers]
-        # each of these chunks has a message of the topic
-        soonest = min((max(c.first, c.last) for c in chunks), default=0)
-        latest = max((min(c.first, c.last) for c in chunks), default=0)
-        found = not chunks
+        numbers = [n for n, channel in self.channels.items() if channel.topic == topic]
+        having = [(c, count) for c in self.chunks if (count := sum(c.counts.get(n, 0) for n in numbers))]
+        soonest = min((max(c.first, c.last) for c, _ in having), default=0)
+        latest = max((min(c.first, c.last) for c, _ in having), default=0)
         with self.path.open("rb") as file, refusing_damage(self.path):
-            for chunk in [c for c in chunks if c.first <= soonest or c.last >= latest]:
+            for chunk, count in [(c, n) for c, n in having if c.first <= soonest or c.last >= latest]:
                 file.seek(chunk.offset)
                 opcode, length = HEAD.unpack(file.read(HEAD.size))
                 if opcode != CHUNK or HEAD.size + length != chunk.length:
                     raise DamageError(f"'{self.path.name}' is damaged at byte {chunk.offset}")
                 budget.left += chunk.length
-                content = unpack_chunk(self.path, file.read(length), budget)
+                content, found = unpack_chunk(self.path, file.read(length), budget), 0
                 for batch in messages_in(self.path, content, Tables(self.channels), budget):
                     if batch.channel.topic == topic:
-                        found = True
+                        found += len(batch.stamps)
                         yield batch
-            if not found:
-                raise DamageError(f"'{self.path.name}' has no messages on {topic}, which its summary counts")
+                if found != count:
+                    where = f"'{self.path.name}' has {found} messages on {topic} at byte {chunk.offset}"
+                    raise DamageError(f"{where}, and {count} according to its summary")
 
 
 def read_summary(path: Path) -> McapSummary | None:
@@ -103,7 +107,7 @@ def read_summary(path: Path) -> McapSummary | None:
 
 def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
     """Return a summary from its records at an offset; None if they are inconsistent."""
-    tables, chunks, counts = Tables(), [], None
+    tables, chunks, counts, indexed = Tables(), list[Chunk](), None, Counter[int]()
     position, stated, chunk_count = 0, 0, 0
     while position < len(content):
         opcode, length = HEAD.unpack_from(content, position)
@@ -111,22 +115,34 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
         if opcode in (SCHEMA, CHANNEL):
             tables.add(path, opcode, content, position)
         elif opcode == CHUNK_INDEX:
-            first, last, offset, size, more = CHUNK_FIELDS.unpack_from(content, position)
-            begin = position + CHUNK_FIELDS.size
-            if CHUNK_FIELDS.size + more > length:  # else many records could share the same bytes
-                return None
-            offsets = content[begin : begin + more]
-            channels = frozenset(number for number, _ in struct.iter_unpack("<HQ", offsets))
-            chunks.append(Chunk(first, last, offset, size, channels))
+            chunks.append(chunk := _chunk(path, content[position : position + length]))
+            for number, count in chunk.counts.items():
+                indexed[number] += count
         elif opcode == STATISTICS:
             stated, *_, chunk_count, _, _, size = STATISTICS_FIELDS.unpack_from(content, position)
             pairs = content[position + STATISTICS_FIELDS.size : position + STATISTICS_FIELDS.size + size]
-            counts = dict(struct.iter_unpack("<HQ", pairs))
+            counts = Counter(dict(struct.iter_unpack("<HQ", pairs)))
         position += length
-    whole = counts is not None and sum(counts.values()) == stated and len(chunks) == chunk_count
-    inside = all(len(MAGIC) <= c.offset and c.offset + c.length <= start for c in chunks)
-    if counts is None or not whole or not inside:
+    if counts is None or counts != indexed or counts.total() != stated or len(chunks) != chunk_count:
         return None
-    indexed = frozenset().union(*(chunk.channels for chunk in chunks))
-    used = {number: count for number, count in counts.items() if count}
-    return McapSummary(path, tables.channels, used, chunks) if used.keys() <= indexed & tables.channels.keys() else None
+    chunks.sort(key=attrgetter("offset"))
+    ends = [len(MAGIC), *(chunk.end for chunk in chunks)]
+    apart = all(end <= begin for end, begin in zip(ends, [*(chunk.offset for chunk in chunks), start]))
+    used = {number: total for number, total in indexed.items() if total}
+    return McapSummary(path, tables.channels, used, chunks) if apart and used.keys() <= tables.channels.keys() else None
+
+
+def _chunk(path: Path, record: bytes) -> Chunk:
+    """Return a chunk from its index record; its message counts follow from the sizes of its message indexes."""
+    first, last, offset, length, size = CHUNK_FIELDS.unpack_from(record)
+    offsets = record[CHUNK_FIELDS.size : CHUNK_FIELDS.size + size]
+    (index_size,) = INDEX_SIZE.unpack_from(record, CHUNK_FIELDS.size + size)
+    begin = offset + length
+    indexes = sorted((place, number) for number, place in struct.iter_unpack("<HQ", offsets))
+    counts, end = dict[int, int](), begin + index_size
+    for place, number in reversed(indexes):
+        counts[number] = (end - place - INDEX_HEAD) // INDEX_ENTRY
+        if counts[number] < 0 or place < begin:
+            raise DamageError(f"'{path.name}' has a damaged summary")
+        end = place
+    return Chunk(first, last, offset, length, begin + index_size, counts)
