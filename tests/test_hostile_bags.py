@@ -3,6 +3,7 @@
 MCAP files are made record by record by the specification. test_records.py tests refusals of contents.
 """
 
+import json
 import shutil
 import sqlite3
 import struct
@@ -21,6 +22,7 @@ from bags import (
     FOOTER,
     HEADER,
     SCHEMA,
+    SECOND,
     channel,
     chunk,
     joint_message,
@@ -127,6 +129,23 @@ def indexed(index: bytes) -> bytes:
     summary = SCHEMA + CHANNEL + index + record(11, struct.pack("<QHIIIIQQI", 1, 1, 1, 0, 0, 100_000, 0, 0, 10), PAIR)
     foot = struct.pack("<BQQQ", 2, 20, len(body), 0)
     return body + summary + foot + struct.pack("<I", crc32(foot, crc32(summary))) + b"\x89MCAP0\r\n"
+
+
+def steered(samples: int, joints: int, changes: int, starts: int) -> Callable[[Path], None]:
+    """A bag with many changes of one input."""
+
+    def change(bag: Path) -> None:
+        names = [f"j{i}" for i in range(joints)]
+        data = serialised(joint_message(0, names, np.zeros(joints)))
+        states = (message(data, 10 * SECOND * k) for k in range(samples))
+        with_mcap(lambda: mcap_of(SCHEMA, CHANNEL, *states))(bag)
+        targets = {f"q_des[{i + 1}]": 0.0 for i in range(joints)}
+        known = {"start_values": {**targets, **{f"s{i}": 0.0 for i in range(starts)}}, "joints": names, "urdf": None}
+        given = {"input_changes": [[k, {"a": k}] for k in range(changes)], "start_time": 0.0, "step": 1.0, "axes": ""}
+        file = bag / "run.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), **known, **given}))
+
+    return change
 
 
 def forged_log(bag: Path) -> None:
@@ -273,6 +292,8 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     "30 MB of provenance": instead(
         "run.json", written(lambda: b'{"format":1,"fmu":{},"x":[' + b'{"a":10},' * (3 * MIB) + b"0]}")
     ),
+    "100,000 changes of an input of 300 joints": steered(3, 300, 100_000, 0),
+    "5,000 changes with 5,000 start values": steered(1200, 1, 5000, 5000),
     "60 MB of provenance": instead("run.json", written(lambda: b'{"format":1,"fmu":[' + b"{}," * (20 * MIB) + b"0]}")),
 }
 

@@ -455,6 +455,17 @@ def test_long_names_in_a_provenance_are_refused(native_path, tmp_path, change, c
     assert "run.json': it has a name of more than 1000 characters" in refused(capsys, bag)
 
 
+@pytest.mark.parametrize("command", ["info", "plot"])
+def test_a_provenance_without_an_element_of_a_target_is_refused(native_path, tmp_path, command, capsys):
+    bag = tmp_path / "bag"
+    twodof.simulate(native_path, twodof.Bag(bag), stop_time=0.1)
+    facts = json.loads((bag / "run.json").read_text())
+    del facts["start_values"]["x_des[2]"]
+    (bag / "run.json").write_text(json.dumps(facts | {"verdict": None}))
+    assert main([command, str(bag)]) == 1
+    assert f"the run.json in '{bag}' does not fit its samples" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("output", ["x.html", "x.png"])
 def test_a_provenance_may_have_half_characters_and_more_facts(native_path, tmp_path, output, capsys):
     bag = tmp_path / "bag"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from array import array
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
+Steps = NDArray[np.int64]
+Changes = list[tuple[int, dict[str, Value]]]
+"""Ascending communication points, and the values of inputs and parameters that change at each."""
 Schedule = list[tuple[int, Mapping[str, Value]]]
 """Ascending communication points, from 0 on, and the values of inputs and parameters that apply from each on."""
 
@@ -68,31 +72,47 @@ class Inputs:
     """Inputs and parameters of a run over time; a bag has one for all its recordings, as the changes may be many."""
 
     def __init__(self, provenance: Provenance) -> None:
-        self.provenance, self._tables = provenance, dict[tuple[str, ...], tuple[list[int], Array]]()
+        self.provenance, self._columns = provenance, dict[tuple[str, ...], list[tuple[Steps, Array]]]()
+
+    @cached_property
+    def changes(self) -> Changes:
+        """Changed values with the communication point from which on they apply."""
+        run = self.provenance
+        changes: Changes = []
+        for time, values in run.get("input_changes", []):
+            k = max(0, ceil((time - run["start_time"]) / run["step"] - TIME_TOLERANCE))
+            if not changes or k != changes[-1][0]:
+                changes.append((k, {}))
+            changes[-1][1].update(values)
+        if not all(map(isfinite, chain(self._starts.values(), *(values.values() for _, values in changes)))):
+            raise ValueError("values are not finite")
+        return changes
 
     @cached_property
     def schedule(self) -> Schedule:
-        """Values with the communication point from which on they apply."""
-        run = self.provenance
-        starts, changes = run.get("start_values", {}), run.get("input_changes", [])
-        if not all(map(isfinite, chain(starts.values(), *(values.values() for _, values in changes)))):
-            raise ValueError("values are not finite")
-        schedule: Schedule = [(0, ChainMap({}, starts))]
+        """All values with the communication point from which on they apply; no change precedes the first sample."""
+        schedule: Schedule = [(0, ChainMap({}, self._starts))]
         changed: dict[str, Value] = {}
-        for time, values in changes:
-            k = max(0, ceil((time - run["start_time"]) / run["step"] - TIME_TOLERANCE))
+        for k, values in self.changes:
             changed = {**changed, **values}
-            if k == schedule[-1][0] and len(schedule) > 1:  # no change precedes the first sample
-                schedule.pop()
-            schedule.append((k, ChainMap(changed, starts)))
+            schedule.append((k, ChainMap(changed, self._starts)))
         return schedule
 
-    def table(self, names: tuple[str, ...]) -> tuple[list[int], Array]:
-        """Return the communication points of the schedule, and the values of some variables from each on."""
-        if names not in self._tables:
-            values = np.array([[float(held[name]) for name in names] for _, held in self.schedule])
-            self._tables[names] = [k for k, _ in self.schedule], values
-        return self._tables[names]
+    @property
+    def _starts(self) -> dict[str, Value]:
+        return self.provenance.get("start_values", {})
+
+    def columns(self, names: tuple[str, ...]) -> list[tuple[Steps, Array]]:
+        """Return the communication points from which on values of some variables apply, and these values."""
+        if names not in self._columns:
+            found = {name: (array("q", [0]), array("d", [self._starts[name]])) for name in names}
+            for k, values in self.changes:
+                for name in found.keys() & values.keys():
+                    begins, column = found[name]
+                    begins.append(k)
+                    column.append(values[name])
+            self._columns[names] = [(np.array(begins), np.array(column)) for begins, column in found.values()]
+        return self._columns[names]
 
 
 @dataclass(frozen=True, repr=False)
@@ -162,8 +182,19 @@ class Recording:
     def schedule(self) -> Schedule:
         """Values of inputs and parameters, with the communication point from which on they apply."""
         with self._fitting():
-            last = self.steps[-1] if self.provenance else 0
+            last = self._last
             return [(k, values) for k, values in self._inputs.schedule if k < last or k == 0]
+
+    @cached_property
+    def changes(self) -> Changes:
+        """Values of inputs and parameters that change, with the communication point from which on they apply."""
+        with self._fitting():
+            last = self._last
+            return [(k, values) for k, values in self._inputs.changes if k < last or k == 0]
+
+    @property
+    def _last(self) -> int:
+        return int(self.steps[-1]) if self.provenance else 0
 
     @contextmanager
     def _fitting(self) -> Iterator[None]:
@@ -173,13 +204,13 @@ class Recording:
             raise BagError(f"the run.json in '{self.path}' does not fit its samples") from error
 
     @cached_property
-    def steps(self) -> NDArray[np.int64]:
+    def steps(self) -> Steps:
         """Number of communication steps before each sample; a recovered bag may have gaps."""
         step = self.provenance.get("step", 0.0)
         least = self.t[-1] / (MOST_LOST * max(self.count, len(self.t)))
         if not (0.0 < step < inf and least <= step):
             raise BagError(f"the run.json in '{self.path}' does not fit its samples")
-        steps: NDArray[np.int64] = np.rint(self.t / step).astype(np.int64)
+        steps: Steps = np.rint(self.t / step).astype(np.int64)
         return steps
 
     @cached_property
@@ -207,9 +238,11 @@ class Recording:
         names = tuple(f"{group}[{i + 1}]" for i in range(size))
         if not size or names[0] not in self.schedule[0][1] or KNOWN_UNTIL in self.provenance:
             return np.empty((len(self.stamps), 0))
-        begins, values = self._inputs.table(names)
+        with self._fitting():
+            columns = self._inputs.columns(names)
         # a change has no effect yet at its own communication point
-        return values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)]
+        places = [np.maximum(np.searchsorted(begins, self.steps) - 1, 0) for begins, _ in columns]
+        return np.column_stack([values[place] for (_, values), place in zip(columns, places)])
 
     def errors(self) -> dict[str, tuple[Array, Array]]:
         """Return the targets up to each sample and the magnitudes of the errors, m or rad, of "x", "quat" and "q"."""
@@ -268,7 +301,7 @@ class Recording:
         values = {"q": self.q, "v": v, "x": x, "tau": self.tau if self.tau.shape == shape else none, "quat": quat}
         samples = {name: each[new] for name, each in values.items()}
         aims = {name: each[new] for name, each in targets.items() if each.size}
-        changes = [(k * setup.step, held) for k, held in self.schedule[1:]] if setup.starts else []
+        changes = [(k * setup.step, values) for k, values in self.changes] if setup.starts else []
         return judged(setup, self.t[new], samples, aims, changes)
 
     @cached_property

@@ -19,9 +19,8 @@ def settings_of(bag: Recording) -> dict[str, str]:
         return {}
     step = f"{1e3 * provenance['step']:g} ms"
     settings = {"FMU": provenance["fmu"]["file"], "robot": provenance["robot"], "step": step}
-    (_, first), *later = bag.schedule
-    given = {name for _, values in provenance["input_changes"] for name in values}
-    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
+    _, first = bag.schedule[0]
+    varied = {_group(n) for _, values in bag.changes for n, value in values.items() if value != first[n]}
     groups: dict[str, list[float | bool]] = {}
     for name, value in first.items():
         groups.setdefault(_group(name), []).append(value)

@@ -297,7 +297,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
     def recorded(group: str) -> list[float]:
         return [float(value) for name, value in first.items() if name.startswith(f"{group}[")]
 
-    external = [name for name in first if name.startswith(("tau_ext[", "f_ext["))]
+    loads = [values for _, values in ((0, first), *bag.changes)]
     astray = bool(off.max() > NOTABLE)
     at_work = {
         "sampling": bool(first.get("control_period")),
@@ -307,7 +307,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         "damping": any(recorded("damping") or (j.damping for j in linkage.urdf.joints.values() if j.moves)),
         "friction": any(recorded("friction")),
         "unknown payload": bool(first.get("payload")) and not first.get("payload_known"),
-        "external torque": any(values[name] for _, values in bag.schedule for name in external),
+        "external torque": any(values[n] for values in loads for n in values if n.startswith(("tau_ext[", "f_ext["))),
     }
     disturbances = tuple(name for name, present in at_work.items() if present)
     return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances)
