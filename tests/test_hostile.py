@@ -372,6 +372,7 @@ HOSTILE_CSVS: dict[str, tuple[Callable[[], bytes], str]] = {
     "a cell of 100,000 digits": (lambda: b"time,Kn\n0," + b"1" * 10**5, "Kn = 1{50} is not finite"),
     "500,000 columns": (lambda: b"time," + b"x," * 500_000, "x is not an input"),
     "a column name of 100,000 letters": (lambda: b"time," + b"x" * 10**5, "no variable 'xxx"),
+    "a column name of 130,000 digits and a letter": (lambda: b"time," + b"1" * 130_000 + b"x\n0,1", "no variable '111"),
 }
 
 

@@ -123,7 +123,7 @@ def _of_another(fmu: Variables, name: str) -> str:
 def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
     """Return the message for an unknown name, with its control law or the nearest names."""
     groups = {g: names for causality in causalities for g, names in groups_of(fmu.variables, causality).items()}
-    indexed = re.sub(r"_?(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
+    indexed = re.sub(r"_?(?<!\d)(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
     known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
     near = nearest(name, known, 0.85)
     if near is None and "." in name:  # Kp of a system, not controller.Kp
