@@ -515,6 +515,21 @@ def test_meshes_of_a_scene_are_opened_by_their_uris(native_path, tmp_path):
             assert content.read() == (bag / "meshes" / Path(name).name).read_bytes()
 
 
+def test_meshes_are_read_from_an_fmu_that_stores_folders(native_path, tmp_path):
+    """As ``zip -r`` and many other tools do."""
+    fmu = tmp_path / "folders.fmu"
+    with zipfile.ZipFile(native_path) as source, zipfile.ZipFile(fmu, "w") as archive:
+        for folder in ("resources/", "resources/meshes/"):
+            archive.writestr(folder, b"")
+        for name in source.namelist():
+            archive.writestr(name, source.read(name))
+    for path in (native_path, fmu):
+        twodof.simulate(path, twodof.Bag(tmp_path / path.stem, meshes=True), stop_time=0.02)
+    folders = [tmp_path / path.stem / "meshes" for path in (native_path, fmu)]
+    plain, other = ({file.name: file.read_bytes() for file in folder.iterdir()} for folder in folders)
+    assert len(plain) >= 2 and other == plain
+
+
 def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path):
     """Pinocchio reads URDF and meshes by the bag's description and the files that it names."""
     fmu = twodof.build_fmu(tmp_path / "panda.fmu", twodof.stock_robot("panda"))

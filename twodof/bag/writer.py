@@ -147,7 +147,8 @@ class Bag(Sink):
         if self._store.fsync:
             sync(self._provenance.path)
         read = resource_reader(run.fmu)
-        for name in [name for name in run.fmu.members if self._meshes and name.startswith("resources/meshes/")]:
+        meshes = [name for name in run.fmu.members if self._meshes and name.startswith("resources/meshes/")]
+        for name in (name for name in meshes if not name.endswith("/")):  # many tools store folders too
             file = self._folder / name.removeprefix("resources/")
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(read(name.removeprefix("resources/")) or b"")
