@@ -5,6 +5,7 @@ a bag.
 """
 
 import json
+import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -124,3 +125,15 @@ def test_layouts_that_were_changed_stay(bag, tmp_path, capsys):
     assert rviz.read_text() == "{}" and not juggler.exists()
     assert main([*command, "--overwrite"]) == 0
     assert rviz.read_bytes() == written and juggler.exists()
+
+
+def huge(file: Path) -> None:
+    file.touch()
+    os.truncate(file, 2**40)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda file: file.symlink_to("/dev/zero"), huge])
+def test_a_pipe_a_device_or_a_huge_file_in_place_of_a_layout_is_not_read(native_path, tmp_path, make, capsys):
+    make(tmp_path / f"{native_path.stem}.rviz")
+    assert main(["layouts", str(native_path), "-o", str(tmp_path)]) == 1
+    assert f"{native_path.stem}.rviz' exists and differs" in capsys.readouterr().err

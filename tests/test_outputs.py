@@ -15,7 +15,8 @@ import pytest
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError
-from twodof.files import write_file
+from twodof.files import free_name, head_of, write_file
+from twodof.pages.arm import is_page
 
 OLD, NEW = b"old", b"new" * 100_000
 
@@ -218,3 +219,10 @@ def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(bag, native_path, 
     piped = subprocess.run([sys.executable, "-m", "twodof", "build", "-o", "-"], capture_output=True, check=True)
     assert zipfile.ZipFile(fmu).testzip() is None and fmu.read_bytes() == piped.stdout
     assert twodof.load_fmu(fmu).joints == ("joint1", "joint2")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda file: file.symlink_to("/dev/zero")])
+def test_a_pipe_or_a_device_with_the_name_of_an_output_is_not_read(make, tmp_path):
+    make(tmp_path / "x.png")
+    assert head_of(tmp_path / "x.png", 100) == b""
+    assert free_name(str(tmp_path / "x"), ".png", is_page) == tmp_path / "x-2.png"

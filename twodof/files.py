@@ -79,8 +79,8 @@ def read_file(path: str | Path, most: int, *, follow: bool = True) -> bytes:
 
 
 def head_of(path: Path, size: int) -> bytes:
-    """Return the first bytes of a file; b"" if it cannot be read."""
-    with suppress(OSError), path.open("rb") as file:
+    """Return the first bytes of a regular file, b"" without one: to open a pipe would wait."""
+    with suppress(OSError), path.open("rb") if path.is_file() else io.BytesIO() as file:
         return file.read(size)
     return b""
 

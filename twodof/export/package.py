@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError, path_of
-from ..files import check_archive, data_file, descriptor_of, refusing, write_file
+from ..files import check_archive, data_file, descriptor_of, head_of, refusing, write_file
 from ..notebook import busy
 from ..plant.urdf import RobotError
 from ..version import versions
@@ -122,7 +122,8 @@ def _build_system(output: str | Path | None, options: FmuOptions, *, overwrite: 
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     content = _zipped({**files, **{name: _zipped(fmu) for name, fmu in fmus.items()}})
     with refusing(BuildError, f"write '{path}'"):
-        if path.is_file() and descriptor_of(path) is None and not overwrite and path.read_bytes() != content:
+        known = overwrite or head_of(path, len(content) + 1) == content
+        if path.is_file() and descriptor_of(path) is None and not known:
             raise BuildError(f"'{path}' is another file, and is not replaced: move it away, or use `overwrite=True`")
         write_file(path, content)
     return path

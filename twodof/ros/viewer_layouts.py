@@ -13,7 +13,7 @@ from string import Template
 from typing import Any
 
 from ..errors import InputError
-from ..files import data_file, refusing, write_file
+from ..files import data_file, head_of, refusing, write_file
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import GAINS
 from ..simulation.experiments import experiment
@@ -62,7 +62,7 @@ def layouts(
     stem = Path(folder, Path(fmu.path).stem)
     contents = {Path(f"{stem}{ending}"): text.encode() for ending, text in texts.items()}
     for path, content in contents.items():
-        if not overwrite and path.exists() and path.read_bytes() != content:
+        if not overwrite and path.exists() and head_of(path, len(content) + 1) != content:
             raise InputError(f"'{path}' exists and differs; choose another folder or give `overwrite=True`")
     with refusing(InputError, f"make the folder '{folder}'"):
         stem.parent.mkdir(parents=True, exist_ok=True)
