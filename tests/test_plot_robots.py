@@ -3,6 +3,7 @@
 import copy
 import math
 import re
+import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,10 +21,13 @@ from recordings import LINK, UR5_JOINTS, bare, build, chain_urdf, record, third_
 import twodof
 from twodof.bag.provenance import Provenance
 from twodof.errors import PlotError, TwoDofError
+from twodof.geometry.kinematics import quaternions
 from twodof.pages.replay import replay
 from twodof.plots.figure import save
+from twodof.plots.linkage import load_linkage
 from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
+from twodof.simulation.setup import setup
 
 ARM = Path(__file__).parents[1] / "urdf/2dof.urdf"
 
@@ -370,3 +374,19 @@ def test_a_bag_whose_robot_makes_no_sense_is_refused(default):
     ):
         with pytest.raises(PlotError, match=message):
             plot(replace(run, provenance=cast(Provenance, {**run.provenance, **spoilt})))
+
+
+def test_memory_of_a_long_chain_is_that_of_the_result():
+    names, frame = [f"j{i + 1}" for i in range(100)], "tip"
+    linkage = load_linkage(chain_urdf("z" * 100), frame, "xyz", names)
+    robot = setup(joints=names, robot=linkage.urdf, frame=frame, axes="xyz", step=0.01, starts={})
+    q = np.random.default_rng(4).normal(size=(20_000, 100))
+    for function, values in ((robot.orientations, 4), (linkage.skeletons, 3 * 102)):
+        tracemalloc.start()
+        function(q)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 8 * len(q) * values + 64 * 1024**2
+    every = [*linkage.kinematics.along(linkage.urdf.chain(frame), q[:9])]
+    np.testing.assert_allclose(robot.orientations(q[:9]), quaternions(every[-1].rotation), atol=1e-13)
+    np.testing.assert_allclose(linkage.skeletons(q[:9])[:, -1], every[-1].translation, atol=1e-13)

@@ -12,7 +12,7 @@ with a in the root's axes. Source: Siciliano, Sciavicco, Villani & Oriolo, "Robo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -127,13 +127,25 @@ class Kinematics:
         moved = offset + ratio * np.asarray(q, dtype=np.float64)[:, column, None]
         return np.where(np.isinf(moved), np.nan, moved)
 
-    def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
-        """Return the transforms of the root and of the child of each joint of a chain from the root."""
+    def along(self, chain: Iterable[Joint], q: ArrayLike) -> Iterator[Placement]:
+        """Yield the transforms of the root and of the child of each joint of a chain from the root."""
         n = len(np.asarray(q))
-        transforms = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
+        here = Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+        yield here
         for joint in chain:
-            transforms.append(transforms[-1] * self.in_parent(joint, q))
-        return transforms
+            here = here * self.in_parent(joint, q)
+            yield here
+
+    def end(self, chain: Iterable[Joint], q: ArrayLike) -> Placement:
+        """Return the transforms of the last child of a chain from the root; joints at rest are composed once."""
+        q = np.asarray(q, dtype=np.float64)
+        here = Placement(np.zeros((len(q), 3)), np.tile(np.eye(3), (len(q), 1, 1)))
+        rest = still = Placement(np.zeros((1, 3)), np.eye(3)[None])
+        for joint in chain:
+            rest = rest * self.in_parent(joint, q)
+            if self.moves(joint):
+                here, rest = here * rest, still
+        return here * rest
 
     def path(self, link: str, q: ArrayLike) -> Array:
         """Return positions of a link's origin in the root frame, N × 3, m."""
@@ -163,7 +175,7 @@ class Kinematics:
     def jacobian(self, link: str, q: ArrayLike) -> Array:
         """Return the Jacobian of the link in the root's axes, N × 6 × joints: linear, then angular rows."""
         chain = self.urdf.chain(link)
-        transforms = self.along(chain, q)
+        transforms = [*self.along(chain, q)]
         end = transforms[-1].translation
         jacobian = np.zeros((len(end), 6, len(self._columns)))
         for joint, transform in zip(chain, transforms[1:]):

@@ -65,7 +65,7 @@ def nearest(
             sliding[column] = joint.prismatic
 
     def residual(at: Array) -> Array:
-        end = kinematics.along(chain, at[None])[-1]
+        end = kinematics.end(chain, at[None])
         off = end.translation[0][list(axes)] - target
         if wanted is None:
             return np.asarray(off)
@@ -78,7 +78,7 @@ def nearest(
     half = np.where(sliding, LONGEST, pi)
     ends = np.where(np.isfinite(low), low, q - half), np.where(np.isfinite(high), high, q + half)
     starts = np.random.default_rng(0).uniform(*ends, (SCATTERED, len(q)))
-    scattered = kinematics.along(chain, starts)[-1]
+    scattered = kinematics.end(chain, starts)
     far = np.linalg.norm(scattered.translation[:, list(axes)] - target, axis=1)
     if wanted:
         far = np.hypot(far, (Rotation.from_matrix(scattered.rotation) * wanted.inv()).magnitude())
@@ -91,6 +91,6 @@ def nearest(
         if found[-1].cost < 0.5 * EXACT**2:
             break
     best = min(found, key=lambda each: each.cost)
-    end, off = kinematics.along(chain, best.x[None])[-1], residual(best.x)
+    end, off = kinematics.end(chain, best.x[None]), residual(best.x)
     distance, angle = (float(np.linalg.norm(part)) for part in np.split(off, [len(axes)]))
     return Nearest(best.x, end.translation[0], distance, angle)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from math import ceil
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ..errors import choice
 from ..export.urdf_source import DEFAULT_FRAME
-from ..geometry.kinematics import Array, Kinematics, rotated
+from ..geometry.kinematics import BLOCK, Array, Kinematics, rotated
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
 
 LOOKS = 2000  # samples that are checked for singularities
@@ -73,9 +74,13 @@ class Linkage(NamedTuple):
     def skeletons(self, q: Array) -> Array:
         """Return origins of the root, of the frame's joints, and of the frame; N × points × 3."""
         chain = self.urdf.chain(self.frame)
-        transforms = self.kinematics.along(chain, q)
-        shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), -1]
-        return np.stack([transforms[i].translation for i in shown], axis=1)
+        shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), len(chain)]
+        points = np.empty((len(q), len(shown), 3))
+        for k in range(0, len(q), BLOCK):
+            along = enumerate(self.kinematics.along(chain, q[k : k + BLOCK]))
+            kept = {i: transform.translation for i, transform in along if i in shown}
+            points[k : k + BLOCK] = np.stack([kept[i] for i in shown], axis=1)
+        return points
 
     def _reach(self) -> Reach | None:
         """Return the reach circle if all joints rotate about one of the root's axes, else None.
@@ -88,7 +93,7 @@ class Linkage(NamedTuple):
         turns = np.abs(
             [
                 rotated(transform.rotation, joint.axis)[0] * (not joint.prismatic)
-                for joint, transform in zip(chain, self.kinematics.along(chain, at_zero)[1:])
+                for joint, transform in zip(chain, islice(self.kinematics.along(chain, at_zero), 1, None))
                 if joint.moves
             ]
         )

@@ -81,10 +81,11 @@ class Setup(NamedTuple):
 
     def orientations(self, q: Array) -> Array:
         """Return orientations of the end effector at N samples, quaternions x, y, z, w, N × 4."""
-        from ..geometry.kinematics import quaternions
+        from ..geometry.kinematics import BLOCK, quaternions
 
         kinematics = self.kinematics
-        return quaternions(kinematics.along(kinematics.urdf.chain(self.frame), q)[-1].rotation)
+        chain, blocks = kinematics.urdf.chain(self.frame), (q[k : k + BLOCK] for k in range(0, len(q), BLOCK))
+        return np.concatenate([quaternions(kinematics.end(chain, block).rotation) for block in blocks])
 
 
 def limits_of(robot: Urdf | None, names: Sequence[str]) -> Limits:
