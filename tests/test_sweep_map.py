@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import browser
 import numpy as np
@@ -14,8 +15,10 @@ from tables import SMALL, table_of
 
 from twodof import read_bag, sweep
 from twodof.cli.main import main
+from twodof.plots import maps
 from twodof.plots.figure import drawn, save
 from twodof.plots.sweeps import drawing
+from twodof.sweeps.ranking import METRICS
 from twodof.sweeps.results import read_sweep
 
 
@@ -183,3 +186,13 @@ def test_a_click_in_the_map_opens_the_runs_curves(native_path, tmp_path, width):
             for (_, x, y), truth in zip(curves, (np.linalg.norm(bag.x - bag.target, axis=1), *bag.q.T)):
                 np.testing.assert_allclose(y, np.interp(x, bag.t, truth), rtol=1e-6, atol=1e-8)
         assert shown.evaluate("document.documentElement.scrollWidth") == width
+
+
+def test_a_page_has_a_limited_number_of_values(grid_sweep, monkeypatch):
+    table, pages = read_sweep(grid_sweep), list[dict[str, Any]]()
+    monkeypatch.setattr(maps, "figures_html", lambda content, _: pages.append(content))
+    for most in (maps.MOST_VALUES, 4 * (2 + len(METRICS))):
+        monkeypatch.setattr(maps, "MOST_VALUES", most)
+        maps.map_page(table, ["Kp", "Kd"], None, [])
+    whole, some = (page["columns"]["run"] for page in pages)
+    assert len(whole) == len(table) > 4 >= len(some) > 1 and some == whole[:: whole.index(some[1])]

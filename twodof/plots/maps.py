@@ -24,7 +24,7 @@ from .strokes import downsampled
 if TYPE_CHECKING:
     import pandas
 
-MOST_RUNS = 20_000  # runs on a page; of a larger sweep, an evenly spaced selection
+MOST_RUNS, MOST_VALUES = 20_000, 1_000_000  # runs on a page, and their values; else an evenly spaced selection
 MOST_NUMBERS = 2_000_000  # of all curves of a page; later runs have no curves
 MOST_CURVES, POINTS = 2000, 200
 """Number of runs whose curves a page contains, and of points in each curve."""
@@ -41,7 +41,8 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
     """
     if find_spec("plotly") is None:
         return ""
-    rows = table.iloc[:: max(1, -(-len(table) // MOST_RUNS))]
+    most = min(MOST_RUNS, MOST_VALUES // (len(varied) + len(METRICS)))
+    rows = table.iloc[:: max(1, -(-len(table) // most))]
     metrics = [name for name in METRICS if rows[name].notna().any()]
     columns = {name: _numbers(rows[name].to_numpy(dtype=float)) for name in ("run", *varied, *metrics)}
     options = table.attrs["provenance"]["options"]
