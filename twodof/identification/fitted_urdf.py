@@ -9,8 +9,9 @@ from typing import Any
 import lxml.etree
 import numpy as np
 
-from ..plant.urdf import Urdf
-from .inertials import INERTIA, inertia_of, inertial_place
+from ..plant.robot import inertial_place
+from ..plant.urdf import INERTIA, Urdf
+from .inertials import inertia_of
 from .parameters import Parameters, Values
 
 OF_DYNAMICS = ("friction", "damping")

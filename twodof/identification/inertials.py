@@ -8,11 +8,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from ..plant.urdf import Urdf
+from ..plant.urdf import INERTIA
 
 Array = NDArray[np.float64]
-INERTIA = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-"""Attributes of <inertia>, and their indices in the matrix."""
 
 
 def inertia_of(second: NDArray[Any]) -> NDArray[Any]:
@@ -40,35 +38,3 @@ def model_with(model: pin.Model, inertial: Array, gravity: Array) -> pin.Model:
     for body, ten in enumerate(inertial.reshape(-1, 10)):
         copy.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
     return copy
-
-
-def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], list[pin.SE3], list[pin.Inertia]]:
-    """Return the moving links with mass: names, bodies, poses in these, and inertias in the links' frames."""
-    names, bodies, places, inertias = [], [], [], []
-    for element in urdf.tree.findall("link"):
-        name = str(element.get("name"))
-        frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
-        inertial = element.find("inertial")
-        if not frame.parentJoint or inertial is None:
-            continue
-        mass = inertial.find("mass")
-        tensor = inertial.find("inertia")
-        if mass is None or tensor is None or not float(mass.get("value", 0.0)):
-            continue
-        about = np.empty((3, 3))
-        for key, (row, column) in INERTIA.items():
-            about[row, column] = about[column, row] = float(tensor.get(key, 0.0))
-        place = inertial_place(inertial)
-        names.append(name)
-        bodies.append(frame.parentJoint - 1)
-        places.append(frame.placement)
-        inertias.append(place.act(pin.Inertia(float(mass.get("value", 0.0)), np.zeros(3), about)))
-    return names, bodies, places, inertias
-
-
-def inertial_place(inertial: Any) -> pin.SE3:
-    """Return the pose of an <inertial> element's frame in its link's frame."""
-    origin = inertial.find("origin")
-    xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))
-    x, r = (np.array([float(word) for word in text.split()]) for text in (xyz, rpy))
-    return pin.SE3(pin.rpy.rpyToMatrix(*r), x)

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, choice
-from ..plant.robot import Robot
-from ..plant.urdf import Urdf
-from .inertials import INERTIA, dynamic_parameters, inertia_of, moving_links, second_moments
+from ..plant.robot import Robot, moving_links
+from ..plant.urdf import INERTIA, Urdf
+from .inertials import dynamic_parameters, inertia_of, second_moments
 
 Array = NDArray[np.float64]
 OF_JOINTS = {

@@ -17,7 +17,8 @@ UNBOUNDED = 1.7976931348623157e308
 
 NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
-INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+INERTIA = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+"""Attributes of <inertia>, and their indices in the matrix."""
 SHAPES = ("visual", "collision")
 MAX_URDF = 8 * 1024**2  # bytes of a file, or characters of a text
 MAX_LINKS = 1000
