@@ -130,14 +130,14 @@ static void add_law(const double value[N_VARIABLES], const JointPosition joint[N
     double change[X][N_JOINTS] = {{0}};
     JointMotion motion[N_BODIES];
     JointForce force[N_BODIES];
-    EndBody known;
+    EndBody known[N_LOADED];
     Matrix M;
-    body(value, 1, &known);
+    body(value, 1, known);
     joint_motions(joint, &value[V], given, &value[GRAVITY], motion);
-    joint_forces(&known, motion, force);
+    joint_forces(known, motion, force);
     add_inverse_dynamics(motion, force, acts, slope);
     add_command(value, joint, stops, first, given, motion, change);
-    mass_matrix(joint, &known, &value[ARMATURE], M);
+    mass_matrix(joint, known, &value[ARMATURE], M);
     for (int i = 0; i < N_JOINTS; i++)
         for (int k = 0; k < N_JOINTS; k++)
             M[k][i] *= acts[i];
@@ -219,7 +219,7 @@ INTERNAL void acceleration_slopes(const Plant *plant, const Stops *stops, double
     const double *value = plant->value, *v = &value[V];
     double a[N_JOINTS], acts[N_JOINTS] = {0}, reaction[N_JOINTS] = {0}, effort[X][N_JOINTS];
     JointPosition joint[N_BODIES];
-    EndBody end_body;
+    EndBody end_body[N_LOADED];
     Matrix M;
     Stops reacting = *stops;
     int clamped = 0;
@@ -236,9 +236,9 @@ INTERNAL void acceleration_slopes(const Plant *plant, const Stops *stops, double
         acceleration(plant, &value[Q], v, slip_of(stops), stops->rank, a, NULL);
         restrain(plant, &reacting, &value[Q], a, reaction);
     }
-    body(value, 0, &end_body);
-    const int moves = set_efforts(value, joint, stops, &end_body, first, a, acts, slope, effort);
-    mass_matrix(joint, &end_body, &value[ARMATURE], M);
+    body(value, 0, end_body);
+    const int moves = set_efforts(value, joint, stops, end_body, first, a, acts, slope, effort);
+    mass_matrix(joint, end_body, &value[ARMATURE], M);
     if (N_FREE)
         add_free_parameters(plant, stops, reaction, M, effort);
     invert_mass(M, stops);

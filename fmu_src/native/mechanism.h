@@ -30,10 +30,17 @@ typedef struct {
 } TaskFrame;
 
 /* The body that carries the task frame, with its payload: mass, mass times centre, and inertia
-   about the frame of its joint: xx, xy, yy, xz, yz, zz. */
+   about the frame of its joint: xx, xy, yy, xz, yz, zz. Where links have inertias that are inputs, it is the first of an
+   array, and the others are the bodies that depend on these. */
 typedef struct {
     double mass, moment[3], inertia[6];
 } EndBody;
+
+#ifdef N_LINK_VALUES
+enum { N_LOADED = N_BODIES, LINK_VALUES = Q - N_LINK_VALUES }; /* the last inputs are those of links */
+#else
+enum { N_LOADED = 1 };
+#endif
 
 /* The position of a revolute joint. */
 INTERNAL JointPosition turn(double angle);
@@ -48,8 +55,12 @@ INTERNAL void task_frame(const JointPosition joint[N_BODIES], const double v[N_J
 INTERNAL void effort_of_force(const JointPosition joint[N_BODIES], const double force[3],
                               double tau[N_JOINTS]);
 
-/* The end_body with a point mass, kg, at an offset in the task frame, m. */
+/* The end_body with a point mass, kg, at an offset in the task frame, m, and all bodies with the values of links. */
+#ifdef N_LINK_VALUES
+INTERNAL void load_bodies(double payload, const double offset[3], const double link[N_LINK_VALUES], EndBody *end_body);
+#else
 INTERNAL void load_end_body(double payload, const double offset[3], EndBody *end_body);
+#endif
 
 /* τ = M(q) a + h(q, v), joint efforts in N·m or N. Gravity is in the root's axes, m/s2. The diagonal of M includes the
    armature, kg·m2 or kg. */

@@ -6,7 +6,7 @@
 
    for any a, where s are the directions in which joints slip against their friction F. With a = q̈_cmd, the dynamics
    cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ
-   where it is known; the armature is in both. */
+   where it is known; the armature is in both. Links whose masses are inputs have their start values in M̂ and ĥ. */
 #include <stddef.h>
 #include <string.h>
 
@@ -29,8 +29,8 @@ static double saturated(double tau, double limit)
     return RE(tau) > RE(limit) ? limit : RE(tau) < -RE(limit) ? -limit : tau;
 }
 
-/* The true robot, or the robot as its control law knows it. */
-static void body(const double value[N_VARIABLES], int as_known, EndBody *end_body)
+/* The true robot, or the robot as its control law knows it, which has the URDF's links. */
+static void body(const double value[N_VARIABLES], int as_known, EndBody end_body[N_LOADED])
 {
     double payload = value[PAYLOAD];
 #if COMMANDS_ACCELERATION
@@ -39,7 +39,14 @@ static void body(const double value[N_VARIABLES], int as_known, EndBody *end_bod
 #else
     (void)as_known;
 #endif
+#ifdef N_LINK_VALUES
+    double link[N_LINK_VALUES];
+    for (int i = 0; i < N_LINK_VALUES; i++)
+        link[i] = as_known ? START[LINK_VALUES + i] : value[LINK_VALUES + i];
+    load_bodies(payload, &value[PAYLOAD_COM], link, end_body);
+#else
     load_end_body(payload, &value[PAYLOAD_COM], end_body);
+#endif
 }
 
 /* True if a sampled controller holds the effort, which is then the output tau. */
@@ -52,6 +59,11 @@ static int is_held(const double value[N_VARIABLES])
 static int knows_all(const double value[N_VARIABLES])
 {
 #if COMMANDS_ACCELERATION
+#ifdef N_LINK_VALUES
+    for (int i = LINK_VALUES; i < LINK_VALUES + N_LINK_VALUES; i++)
+        if (value[i] != START[i])
+            return 0;
+#endif
     return !is_held(value) && (value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0);
 #else
     (void)value;
@@ -65,9 +77,9 @@ static void wanted_effort(const double value[N_VARIABLES], const JointPosition j
                           double tau[N_JOINTS])
 {
 #if COMMANDS_ACCELERATION
-    EndBody known;
-    body(value, 1, &known);
-    inverse_dynamics(joint, &known, &value[ARMATURE], v, given, &value[GRAVITY], tau);
+    EndBody known[N_LOADED];
+    body(value, 1, known);
+    inverse_dynamics(joint, known, &value[ARMATURE], v, given, &value[GRAVITY], tau);
 #else
     (void)value, (void)joint, (void)v;
     memcpy(tau, given, N_JOINTS * sizeof *tau);
@@ -86,9 +98,9 @@ static int may_saturate(const double value[N_VARIABLES], const JointPosition joi
 {
     const double with_rounding = 1.0 + 1e-9;
     double bound[N_JOINTS];
-    EndBody known;
-    body(value, 1, &known);
-    effort_bounds(joint, &known, &value[ARMATURE], v, a, &value[GRAVITY], bound);
+    EndBody known[N_LOADED];
+    body(value, 1, known);
+    effort_bounds(joint, known, &value[ARMATURE], v, a, &value[GRAVITY], bound);
     for (int i = 0; i < N_JOINTS; i++)
         if (!(RE(bound[i] * with_rounding) < RE(EFFORT[i])))
             return 1;
@@ -107,9 +119,9 @@ static void add_excess(const double value[N_VARIABLES], const JointPosition join
         wanted_effort(value, joint, v, given, tau);
     memcpy(needed, tau, sizeof needed);
     if (!knows_all(value)) {
-        EndBody end_body;
-        body(value, 0, &end_body);
-        inverse_dynamics(joint, &end_body, &value[ARMATURE], v, a, &value[GRAVITY], needed);
+        EndBody end_body[N_LOADED];
+        body(value, 0, end_body);
+        inverse_dynamics(joint, end_body, &value[ARMATURE], v, a, &value[GRAVITY], needed);
     }
     limit_effort(value, tau);
     for (int i = 0; i < N_JOINTS; i++)
@@ -187,9 +199,9 @@ INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const do
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
-        EndBody end_body;
-        body(value, 0, &end_body);
-        acceleration_of_effort(joint, &end_body, &value[ARMATURE], excess, further);
+        EndBody end_body[N_LOADED];
+        body(value, 0, end_body);
+        acceleration_of_effort(joint, end_body, &value[ARMATURE], excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
@@ -203,7 +215,7 @@ INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS],
                                    double reaction[N_JOINTS], double *margin)
 {
     JointPosition joint[N_BODIES];
-    EndBody end_body;
+    EndBody end_body[N_LOADED];
     double excess[N_JOINTS], free[N_JOINTS], given[N_JOINTS], further[N_JOINTS], effort[N_JOINTS];
     place_joints(q, joint);
     find_excess(plant->value, joint, q, v, slip, rank, a, excess, margin);
@@ -211,8 +223,8 @@ INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS],
         free[i] = rests[i] ? 0.0 : 1.0;
         given[i] = rests[i] ? -a[i] : excess[i];
     }
-    body(plant->value, 0, &end_body);
-    hybrid_dynamics(joint, &end_body, &plant->value[ARMATURE], free, given, further, effort);
+    body(plant->value, 0, end_body);
+    hybrid_dynamics(joint, end_body, &plant->value[ARMATURE], free, given, further, effort);
     for (int i = 0; i < N_JOINTS; i++) {
         a[i] = rests[i] ? 0.0 : a[i] + further[i];
         reaction[i] = rests[i] ? effort[i] - excess[i] : 0.0;
@@ -225,10 +237,10 @@ static void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const do
                           double reaction[N_JOINTS])
 {
     JointPosition joint[N_BODIES];
-    EndBody end_body;
+    EndBody end_body[N_LOADED];
     place_joints(q, joint);
-    body(plant->value, 0, &end_body);
-    hybrid_dynamics(joint, &end_body, armature, free, given, a, reaction);
+    body(plant->value, 0, end_body);
+    hybrid_dynamics(joint, end_body, armature, free, given, a, reaction);
 }
 #endif
 
@@ -238,21 +250,21 @@ static void compute_equations(Plant *plant, const JointPosition joint[N_BODIES],
     (void)plant, (void)joint, (void)task;
 #if defined HAS_M || defined HAS_H
     const double still[N_JOINTS] = {0};
-    EndBody end_body;
-    body(plant->value, 0, &end_body);
+    EndBody end_body[N_LOADED];
+    body(plant->value, 0, end_body);
 #endif
 #ifdef HAS_M
     for (int k = 0; k < N_JOINTS; k++) { /* a column for each acceleration of 1 */
         const double weightless[3] = {0};
         double unit[N_JOINTS] = {0}, column[N_JOINTS];
         unit[k] = 1.0;
-        inverse_dynamics(joint, &end_body, &plant->value[ARMATURE], still, unit, weightless, column);
+        inverse_dynamics(joint, end_body, &plant->value[ARMATURE], still, unit, weightless, column);
         for (int i = 0; i < N_JOINTS; i++)
             plant->value[M + i * N_JOINTS + k] = column[i];
     }
 #endif
 #ifdef HAS_H
-    inverse_dynamics(joint, &end_body, &plant->value[ARMATURE], &plant->value[V], still, &plant->value[GRAVITY],
+    inverse_dynamics(joint, end_body, &plant->value[ARMATURE], &plant->value[V], still, &plant->value[GRAVITY],
                      &plant->value[H]);
 #endif
 #ifdef HAS_J

@@ -51,7 +51,8 @@ def add(build: Parser) -> None:
     option("--split", action="store_const", dest="part", const="split", help=text)
     text = "further outputs: mass matrix, nonlinear effects, Jacobian, or its drift"
     option("--with", dest="outputs", nargs="+", choices=("M", "h", "J", "drift"), default=[], help=text)
-    text = "make a native FMU's parameter an input, with derivatives: gravity, payload, 'friction[*]', …; repeatable"
+    text = "make a native FMU's parameter an input, with derivatives: gravity, payload, payload_com, 'friction[*]',"
+    text += " 'damping[*]', 'armature[*]', mass:LINK, com:LINK, inertia:LINK; repeatable"
     build.add_repeatable("--free", metavar="P", help=text)
     flag("--orientation", help="control the frame's orientation and position")
     add_options(build, "--set")

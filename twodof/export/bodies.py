@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,41 @@ class Body:
         return Body(self.mass, d + p * self.mass, symmetric(inertia))
 
 
+class Inertial(NamedTuple):
+    """Mass, kg, centre of mass, m, and inertia about it, kg·m², 3 × 3."""
+
+    mass: Scalar
+    com: Array
+    inertia: Array
+
+
+@dataclass(frozen=True)
+class FreeLink:
+    """A link whose mass, centre of mass or inertia varies.
+
+    Attributes:
+        body: index of the joint that moves it.
+        R, p: pose of its frame in Pinocchio's frame of this joint.
+        given: its values in the URDF, in its own frame.
+        free: the same values with variables in the place of those that vary.
+    """
+
+    body: int
+    R: Array
+    p: Array
+    given: Inertial
+    free: Inertial
+
+    def change(self, R: Array, p: Array) -> Body:
+        """Return what the link adds to its body's given values, in a frame in which the link has the pose (R, p)."""
+        (given, com, inertia), (mass, own_com, own_inertia) = self.given, self.free
+        added = Body(0.0, np.zeros(3), R.dot(own_inertia - inertia).dot(R.T))
+        if own_com is not com:
+            return added.with_point(mass, R.dot(own_com) + p).with_point(-given, R.dot(com) + p)
+        unit, more = Body(0.0, np.zeros(3), np.zeros((3, 3))).with_point(1.0, R.dot(com) + p), mass - given
+        return added + Body(more, unit.moment * more, unit.inertia * more)
+
+
 def cross(a: Array, b: Array) -> Array:
     """Return a × b, also for expressions, which np.cross refuses in NumPy 2.2."""
     product: Array = a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
@@ -94,8 +129,11 @@ class JointTree:
     c: Array
 
 
-def joint_tree(robot: Robot) -> JointTree:
-    """Return the constants of a robot from Pinocchio's model, in frames in which many of them are 0."""
+def joint_tree(robot: Robot, links: Sequence[FreeLink] = ()) -> JointTree:
+    """Return the constants of a robot from Pinocchio's model, in frames in which many of them are 0.
+
+    Bodies with links that vary have expressions of the links' variables.
+    """
     model = robot.model
     subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
     slides = tuple(bool(axis[:3].any()) for axis in subspaces)
@@ -114,6 +152,9 @@ def joint_tree(robot: Robot) -> JointTree:
         origins.append(_without_rounding(base.T @ (p + R @ origin - zero)))
         centred = Body(0.0, np.zeros(3), own.T @ inertia.inertia @ own)
         bodies.append(centred.with_point(inertia.mass, own.T @ (inertia.lever - origin)))
+    for link in links:
+        own, origin = frames[link.body]
+        bodies[link.body] += link.change(own.T @ link.R, own.T @ (link.p - origin))
     base, zero = frames[path[-1]]
     constants = JointTree(
         parent=parents,
@@ -184,6 +225,9 @@ def _without_rounding(values: Array) -> Array:
     return np.where(np.abs(values - whole) < 1e-15, whole, values)
 
 
+WITHOUT_YY = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+
+
 def _regrouped(robot: JointTree) -> tuple[Body, ...]:
     """Return the bodies, with mass that a joint cannot distinguish moved to its parent.
 
@@ -197,7 +241,7 @@ def _regrouped(robot: JointTree) -> tuple[Body, ...]:
             continue
         b, parent = bodies[i], robot.parent[i]
         rod = Body(b.mass, b.moment * [0, 0, 1], np.diag([1.0, 1.0, 0.0]) * b.inertia[1, 1])
-        bodies[i] = Body(0.0, b.moment - rod.moment, b.inertia - rod.inertia)
+        bodies[i] = Body(0.0, b.moment * [1, 1, 0], (b.inertia - rod.inertia) * WITHOUT_YY)
         if parent >= 0:
             bodies[parent] = bodies[parent] + rod.moved(robot.R[i], robot.p[i])
     return tuple(bodies)

@@ -14,10 +14,12 @@ from ..plant.plant import ParameterError, Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import read_urdf
 from ..plant.variables import CONTROLS, Starts, Value, Variable, controller_table, free_table, variable_table
+from .bodies import FreeLink
 from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .fmu_options import FmuOptions
+from .free_links import free_links
 from .icon import icon
 from .mesh_files import collect_meshes
 from .model_description import model_description
@@ -61,9 +63,11 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
         table = controller_table(table)
         if options.clocked and not next(v.start for v in table if v.group == "control_period"):
             raise BuildError("the clock needs the controller's period; set control_period, to 0.005 s for example")
-    table = free_table(table, options.free) if options.free else table
+    patterns = [name for name in options.free if ":" in name]
+    links, values = free_links(read_urdf(text), robot, patterns) if patterns else ([], [])
+    table = free_table(table, options.free, values) if options.free else table
     urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
-    flavour = _flavour(options, robot, table, urdf, starts)
+    flavour = _flavour(options, robot, table, links, urdf, starts)
     resources = {"robot.urdf": urdf.encode(), **meshes}
     files = {f"resources/{name}": content for name, content in resources.items()}
     files.update(flavour.files)
@@ -91,7 +95,9 @@ def fmi_version(options: FmuOptions) -> int:
     return options.fmi or (2 if options.platforms or host_platform() else 3)
 
 
-def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Starts) -> Flavour:
+def _flavour(
+    options: FmuOptions, robot: Robot, table: list[Variable], links: list[FreeLink], urdf: str, starts: Starts
+) -> Flavour:
     if not options.native:
         if options.platforms or options.fmi not in (None, 2) or not options.arrays:
             raise BuildError(
@@ -114,7 +120,7 @@ def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str
             raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'{other}")
     if fmi == 2 and not options.arrays:
         raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` goes with `fmi=3`")
-    return native_flavour(options, robot, table, fmi, platforms)
+    return native_flavour(options, robot, table, fmi, platforms, links)
 
 
 def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:

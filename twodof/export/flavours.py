@@ -17,6 +17,7 @@ from ..errors import BuildError
 from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Starts, Variable
+from .bodies import FreeLink
 from .compiler import EXTENSIONS, UNITS, compile_library, standard_headers
 from .fmi3_files import build_description, terminals_and_icons
 from .fmu_options import FmuOptions
@@ -99,13 +100,18 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
 
 
 def native_flavour(
-    options: FmuOptions, robot: Robot, table: Sequence[Variable], fmi: int, platforms: Sequence[str]
+    options: FmuOptions,
+    robot: Robot,
+    table: Sequence[Variable],
+    fmi: int,
+    platforms: Sequence[str],
+    links: Sequence[FreeLink] = (),
 ) -> Flavour:
     """Return the native flavour: the plant as C99 sources, compiled for the platforms."""
     name, control, arrays = options.name, options.control, options.arrays and fmi == 3
     headers = standard_headers()
     sources = engine_sources(control, fmi)
-    sources["mechanism.c"] = mechanism_source(robot, table).encode()
+    sources["mechanism.c"] = mechanism_source(robot, table, links).encode()
     if fmi == 2:  # in 3.0 the importer provides them, so that compilers check arguments
         sources |= {file: text for file, text in headers.items() if file.startswith("fmi2")}
 

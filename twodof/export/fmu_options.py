@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..errors import BuildError, choice
-from ..plant.variables import CONTROLS, FREE, ON_REQUEST
+from ..plant.variables import CONTROLS, FREE, OF_LINKS, ON_REQUEST
 
 DEFAULT_NAME = "TwoDof"
 OF_THE_FLAVOUR = ("mesh_dir", "meshes", "link_environment", "native", "fmi", "arrays", "platforms", "reference")
@@ -30,8 +30,9 @@ class FmuOptions:
         q_start: start positions, rad or m, in the order of the joints or by name; default: the shipped arm's
             positions, or 0 if it is within the limits, or the middle of the limits.
         outputs: further outputs for controllers: "M" mass matrix, "h" nonlinear effects, "J" Jacobian, "drift" J̇ v.
-        free: parameters that are inputs of a native FMU, groups of ``FREE``: they may change during a run, and
-            the FMU has derivatives with respect to them.
+        free: parameters that are inputs of a native FMU: they may change during a run, and the FMU has derivatives
+            with respect to them. They are groups of ``FREE``, and ``mass:LINK``, ``com:LINK`` and ``inertia:LINK`` by
+            name or shell pattern, the links' values as in ``fit``.
         settings: start values of variables by name, as in ``experiment``.
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".
@@ -89,8 +90,10 @@ class FmuOptions:
             if name not in ON_REQUEST:
                 raise BuildError(f"`outputs` '{name}' is unknown{choice(name, ON_REQUEST)}")
         for name in self.free:
-            if name not in FREE:
-                raise BuildError(f"`free` '{name}' is not a parameter that can be an input{choice(name, FREE)}")
+            group, _, link = name.partition(":")
+            if name not in FREE and not (group in OF_LINKS and link):
+                known = [*FREE, *(f"{group}:LINK" for group in OF_LINKS)]
+                raise BuildError(f"`free` '{name}' is not a parameter that can be an input{choice(name, known)}")
         if self.free and (not self.native or self.part != "all"):
             raise BuildError("`free` goes with the whole robot as a native FMU, `native=True`")
         if self.part == "controller" and self.outputs:

@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from ..plant.robot import Robot
-from ..plant.variables import Variable
-from .bodies import Array, Body, JointTree, joint_tree
+from ..plant.variables import OF_LINKS, Variable
+from .bodies import Array, Body, FreeLink, JointTree, joint_tree
 from .derivatives import joint_forces, joint_motions
 from .recursions import (
     effort_bounds,
@@ -21,9 +21,9 @@ from .recursions import (
 from .straight_line import Expression, Value, Varied, c_function, operations, varied
 
 
-def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
+def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[FreeLink] = ()) -> str:
     """Return the text of ``mechanism.c``: the robot's kinematics and dynamics as straight-line code."""
-    n, constants = len(robot.joints), joint_tree(robot)
+    n, constants = len(robot.joints), joint_tree(robot, links)
     joint = np.array(
         [
             (Expression(f"joint[{i}].c"), 0.0 if slides else Expression(f"joint[{i}].s"))
@@ -51,7 +51,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     functions = {
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
         f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements("tau", J[:3].T.dot(force)),
-        "load_end_body(double payload, const double offset[3], EndBody *end_body)": load,
+        f"{LOAD_BODIES if links else LOAD_END_BODY}, EndBody *end_body)": load,
         f"inverse_dynamics({motion}, double tau[N_JOINTS])": _elements("tau", effort),
     }
     alike = {
@@ -136,8 +136,13 @@ MECHANISM = """\
 #include <math.h>
 """
 INERTIAS = "const EndBody *end_body, const double armature[N_JOINTS]"
+LOAD_END_BODY = "load_end_body(double payload, const double offset[3]"
+LOAD_BODIES = "load_bodies(double payload, const double offset[3], const double link[N_LINK_VALUES]"
 END_BODY = ("end_body->", "payload", "offset[")
-OF_PARAMETER = {"armature": ("armature[",), "gravity": ("gravity[",), "payload": END_BODY, "payload_com": END_BODY}
+OF_PARAMETER = {
+    **{"armature": ("armature[",), "gravity": ("gravity[",), "payload": END_BODY, "payload_com": END_BODY},
+    **dict.fromkeys(OF_LINKS, ("end_body->",)),
+}
 """The C variables of parameters, with respect to which there are derivatives only if they are inputs."""
 LOWER = np.tril_indices(3)
 
@@ -166,16 +171,27 @@ def _places(robot: JointTree) -> dict[str, Value]:
 
 
 def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
-    """Return the bodies, with variables for the last one, which carries the payload, and the variables' names."""
+    """Return the bodies, with variables for what varies, and the values of these variables by name.
+
+    They are all values of the end body, which carries the payload, and those of other bodies that depend on free links.
+    """
     end_body, offset = robot.path[-1], _variables("offset", 3)
-    loaded = robot.body[end_body].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
-    load = {"end_body->mass": loaded.mass}
-    load |= _elements("end_body->moment", loaded.moment)
-    load |= _elements("end_body->inertia", loaded.inertia[LOWER])
-    inertia = np.zeros((3, 3), dtype=object)
-    inertia[LOWER] = inertia.T[LOWER] = _variables("end_body->inertia", 6)
-    bodies = list(robot.body)
-    bodies[end_body] = Body(Expression("end_body->mass"), _variables("end_body->moment", 3), inertia)
+    bodies, load, count = list(robot.body), dict[str, Value](), 1
+    loaded = bodies[end_body].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
+    for i, body in enumerate(bodies):
+        name = "end_body->" if i == end_body else f"end_body[{count}]."
+        body = loaded if i == end_body else body
+        values: dict[str, Value] = {f"{name}mass": body.mass}
+        values |= _elements(f"{name}moment", body.moment) | _elements(f"{name}inertia", body.inertia[LOWER])
+        varying = {key: value for key, value in values.items() if i == end_body or isinstance(value, Expression)}
+        if not varying:
+            continue
+        ten = [Expression(key) if key in varying else value for key, value in values.items()]
+        inertia = np.zeros((3, 3), dtype=object)
+        inertia[LOWER] = inertia.T[LOWER] = ten[4:]
+        bodies[i] = Body(ten[0], np.array(ten[1:4], dtype=object), inertia)
+        load |= varying
+        count += i != end_body
     return bodies, load
 
 

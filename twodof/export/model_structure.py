@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
 
 from ..plant.robot import Robot
-from ..plant.variables import DISTURBANCES, FREE, Control, Variable
+from ..plant.variables import DISTURBANCES, OF_LINKS, Control, Variable
 from .native import INDICATORS
 
 UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "InitialUnknowns": "InitialUnknown"}
@@ -15,8 +15,9 @@ UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "
 STATES = ("q", "v")
 START = ("q_start", "q_min", "q_max")
 """Variables on which the start value of q depends."""
-INERTIAL = ("payload", "payload_com", "armature")
-"""Parameters that the mass matrix has."""
+KNOWN = ("payload", "payload_com", "armature")
+INERTIAL = (*KNOWN, *OF_LINKS)
+"""Parameters that the mass matrix has, and of these those that the control law's mass matrix may have."""
 IMPACT = (*START, "v_start", *INERTIAL, "rigid_stops")
 """Variables on which the start value of v depends, because a velocity into a stop is removed."""
 OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
@@ -46,7 +47,7 @@ def _dependencies(control: Control, free: Collection[str]) -> tuple[dict[str, De
         "h": ((*STATES, *within((*INERTIAL, "gravity"))), EVERY),
         "J": (("q",), FRAME),
         "drift": (STATES, FRAME),
-        "tau": ((*STATES, *control.inputs, *within((*INERTIAL, "gravity"))), EVERY),
+        "tau": ((*STATES, *control.inputs, *within((*KNOWN, "gravity"))), EVERY),
         "q_meas": (("q",), OWN),
         "v_meas": (STATES, OWN),
         "der_v": ((*STATES, *inputs), EVERY),
@@ -75,9 +76,7 @@ def add_structure(
 ) -> None:
     """Add ModelStructure: the unknowns, with the references of the variables on which each depends."""
     moves = robot.moves_frame()
-    during, at_the_start = _dependencies(
-        control, {v.group for v in table if v.group in FREE and v.causality == "input"}
-    )
+    during, at_the_start = _dependencies(control, {v.group for v in table if v.is_free})
 
     def known(unknown: Variable, groups: Sequence[str], whose: str, own: Sequence[str] = ()) -> dict[str, None]:
         """Return the sorted references of the variables on which an unknown depends."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..plant.regime import BUDGET
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, FREE, ON_REQUEST, RANGES, Variable, count_event_indicators
+from ..plant.variables import CONTROLS, OF_LINKS, ON_REQUEST, RANGES, Variable, count_event_indicators
 
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_INTEGER": "seed", "FIRST_BOOLEAN": "v_from_q"}
 """First group of each part of the table: outputs, parameters, and among these integers and Booleans."""
@@ -35,7 +35,8 @@ def model_header(
     m = len(robot.axes)
     table = engine_variables(robot, table, control, fmi)
     groups = [variable.group for variable in table]
-    n_free = sum(variable.group in FREE and variable.causality == "input" for variable in table)
+    n_free = sum(variable.is_free for variable in table)
+    n_links = sum(group in OF_LINKS for group in groups)
     is_controller = table[groups.index("q")].causality == "input"
     sections = [
         "/* Constants of a robot, generated from its URDF. SI units. */\n"
@@ -50,7 +51,8 @@ def model_header(
         f"#define IS_CONTROLLER {int(is_controller)} /* the control law alone: q and v are inputs */\n"
         f"#define IS_CLOCKED {int(clocked)} /* an importer with event mode ticks the samples */\n"
         + "".join(f"#define HAS_{group.upper()}\n" for group in ("rcond", *ON_REQUEST) if group in groups),
-        f"enum {{ N_FREE = {n_free} }}; /* parameters that are inputs */\n",
+        f"enum {{ N_FREE = {n_free} }}; /* parameters that are inputs */\n"
+        + (f"#define N_LINK_VALUES {n_links} /* values of links among them */\n" if n_links else ""),
         _groups(groups, {**FIRST, "FIRST_OUTPUT": "x"} if is_controller else FIRST),
         _references(table, fmi == 3 and arrays),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),

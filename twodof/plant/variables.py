@@ -35,7 +35,7 @@ POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
 GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
     **dict.fromkeys((*GAINS, "payload", "friction", "damping", "armature"), NOT_NEGATIVE),
-    **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),
+    **dict.fromkeys(("rtol", "atol", "max_step", "mass"), POSITIVE),
     "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
     **dict.fromkeys(("control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), NOT_NEGATIVE),
     "seed": Range(0, 2**31 - 1, "in [0, 2147483647]"),
@@ -79,6 +79,11 @@ class Variable:
             return f"{group}[{self.index // self.columns + 1},{self.index % self.columns + 1}]"
         name = group if self.index is None else f"{group}[{self.index + 1}]"
         return f"der({name})" if self.derivative_of else name
+
+    @property
+    def is_free(self) -> bool:
+        """True for an input that is else a parameter or a constant."""
+        return self.causality == "input" and self.group in (*FREE, *OF_LINKS)
 
     @property
     def derivative_of(self) -> str:
@@ -148,6 +153,8 @@ ON_REQUEST = ("M", "h", "J", "drift")
 DISTURBANCES = ("tau_ext", "f_ext")
 FREE = ("gravity", "payload", "payload_com", "friction", "damping", "armature")
 """Groups of parameters that may be inputs, which can change during a run and have derivatives."""
+OF_LINKS = ("mass", "com", "inertia")
+"""Groups of values of links that may be inputs; else they are constants."""
 OF_THE_PLANT = {
     *DISTURBANCES,
     *("x", "xd", "quat", "omega", "q_start", "v_start", "q_min", "q_max", "rtol", "atol", "max_step"),
@@ -263,12 +270,12 @@ def variable_table(
     return table
 
 
-def free_table(table: Sequence[Variable], free: Collection[str]) -> list[Variable]:
-    """Return the table with groups of parameters as further inputs, behind the others."""
+def free_table(table: Sequence[Variable], free: Collection[str], links: Sequence[Variable] = ()) -> list[Variable]:
+    """Return the table with groups of parameters, and then values of links, as further inputs behind the others."""
     rest = [variable for variable in table if variable.group not in free]
     first = next(i for i, variable in enumerate(rest) if variable.causality == "output")
     inputs = [replace(variable, causality="input") for variable in table if variable.group in free]
-    return [*rest[:first], *inputs, *rest[first:]]
+    return [*rest[:first], *inputs, *links, *rest[first:]]
 
 
 def controller_table(table: Sequence[Variable]) -> list[Variable]:
