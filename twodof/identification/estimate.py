@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from ..errors import InputError
 from .parameters import SEEN, Parameters, Values
-from .regression import EDGES, Rows, jacobian, residual, rows_of
+from .regression import EDGES, Rows, jacobian, residual, rows_of, stretched
 from .stretches import Array, Stretch
 
 PRIOR = 3.0
@@ -28,8 +29,10 @@ PRIOR_SHARE = 0.1
 """Share of the prior in the variance of a value, above which the data do not determine the value."""
 SHARP = 0.05
 """Standard deviation relative to a value, below which the data determine it whatever the prior's share."""
+SEPARATE = 1e-6
+"""Part of the power of an error that the coordinates cannot replace, below which the error is not tested."""
 SIGNIFICANCE = 1e-4
-"""Probability of slow residuals below which they are not noise."""
+"""Probability of residuals below which they are not noise."""
 
 
 class Misfit(NamedTuple):
@@ -55,6 +58,20 @@ class Misfit(NamedTuple):
         return self.probability < SIGNIFICANCE or self.part > 1.0
 
 
+class Suspect(NamedTuple):
+    """An error of the setup that the residuals show.
+
+    Attributes:
+        name: name of the parameter, as in patterns, or "clock".
+        size: most likely error: rad or m, or a part of efforts or speeds.
+        probability: probability of such residuals without the error.
+    """
+
+    name: str
+    size: float
+    probability: float
+
+
 class Estimate(NamedTuple):
     """Result of an estimation of p coordinates and the delay.
 
@@ -67,7 +84,7 @@ class Estimate(NamedTuple):
         delay: delay of recorded efforts, s, and its standard deviation.
         noise: standard deviation of the efforts' noise, N·m or N, n.
         misfits: comparison of residuals for each joint.
-        evaluations: number of evaluations of the residuals.
+        suspects: errors that the residuals show, the most probable one first.
         converged: False if the last solution still moved after its most steps.
     """
 
@@ -79,7 +96,7 @@ class Estimate(NamedTuple):
     delay: tuple[float, float]
     noise: Array
     misfits: tuple[Misfit, ...]
-    evaluations: int
+    suspects: tuple[Suspect, ...]
     converged: bool
 
 
@@ -90,23 +107,23 @@ def estimate(
     x, low, scales = parameters.coordinates(typical(stretches))
     scales, low = np.append(scales, DELAY_SCALE), np.append(low, -np.inf)
     start = np.append(x, 0.0)
-    z, evaluations = start.copy(), 0
+    z = start.copy()
     rows: list[Rows] = []
     sd: list[Array] = []
     relinearise = any(free.group == "offset" for free in parameters.free)
     for k in range(PASSES):
-        if not rows or relinearise or abs(z[-1] - rows[0].about[1]) > LARGEST_SHIFT:
+        last = k == PASSES - 1  # for the tests of offsets
+        if not rows or relinearise or last or abs(z[-1] - rows[0].about[1]) > LARGEST_SHIFT:
             about = parameters.dynamics(parameters.values(z[:-1]))
-            rows = rows_of(parameters.robot, about, stretches, float(z[-1]), relinearise)
+            rows = rows_of(parameters.robot, about, stretches, float(z[-1]), relinearise or last)
         sd = sd or [np.full(len(each.tau), FIRST_NOISE * np.sqrt(np.mean(each.tau**2))) for each in rows]
-        steps = LAST_STEPS if k == PASSES - 1 else STEPS
-        solved = _solve(parameters, rows, sd, z, start, low, scales, steps)
-        z, evaluations = solved.x, evaluations + solved.nfev
+        solved = _solve(parameters, rows, sd, z, start, low, scales, LAST_STEPS if last else STEPS)
+        z = solved.x
         dynamics = parameters.dynamics(parameters.values(z[:-1]))
         sd = [_deviations(each, residual(each, dynamics, float(z[-1]))) for each in rows]
         finished()
     converged = bool(solved.status > 0 and abs(z[-1] - rows[0].about[1]) <= LARGEST_SHIFT)
-    return _result(parameters, rows, sd, z, scales, evaluations, converged)
+    return _result(parameters, rows, sd, z, scales, converged)
 
 
 def typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
@@ -168,13 +185,7 @@ def _deviations(rows: Rows, errors: Array) -> Array:
 
 
 def _result(
-    parameters: Parameters,
-    rows: Sequence[Rows],
-    sd: Sequence[Array],
-    z: Array,
-    scales: Array,
-    evaluations: int,
-    converged: bool,
+    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, scales: Array, converged: bool
 ) -> Estimate:
     J = information_root(parameters, rows, sd, z) * scales
     strengths, directions = np.linalg.eigh(J.T @ J)
@@ -183,13 +194,14 @@ def _result(
     reported = np.zeros((len(parameters.names) + 1, len(z)))
     reported[:-1, :-1], reported[-1, -1] = parameters.rates(z[:-1])[0], 1.0
     spread = (reported * scales) @ directions
-    covariance = spread * variances @ spread.T
-    total = np.diag(covariance)
+    total = (spread**2) @ variances
     by_prior = (spread[:, unseen] ** 2) @ variances[unseen]
     values = parameters.values(z[:-1])
     sharp = np.sqrt(total[:-1]) <= SHARP * np.abs(parameters.reported(values))
     known = sharp | (by_prior <= PRIOR_SHARE * total)[:-1]
     dynamics = parameters.dynamics(values)
+    shown, added = _suspects(parameters, rows, sd, z, J, directions * variances @ directions.T)
+    covariance = spread @ (np.diag(variances) + directions.T @ added @ directions) @ spread.T
     misfits = [_misfit(each, residual(each, dynamics, float(z[-1])), len(z) / len(rows)) for each in rows]
     noise = np.array([np.sqrt(np.mean(residual(each, dynamics, float(z[-1])) ** 2)) for each in rows])
     return Estimate(
@@ -198,12 +210,39 @@ def _result(
         covariance=covariance[:-1, :-1],
         known=known,
         unseen=directions[:-1, unseen].T,
-        delay=(float(z[-1]), float(np.sqrt(total[-1]))),
+        delay=(float(z[-1]), float(np.sqrt(covariance[-1, -1]))),
         noise=noise,
         misfits=tuple(misfits),
-        evaluations=evaluations,
+        suspects=shown,
         converged=converged,
     )
+
+
+def _suspects(
+    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, J: Array, N: Array
+) -> tuple[tuple[Suspect, ...], Array]:
+    """Return the errors that whitened residuals r show, most probable first, and the covariance that they add.
+
+    J is the Jacobian of r, and N the covariance of the coordinates. Of an error's derivatives e, the coordinates
+    replace J N Jᵀ e, and e⟂ is the rest. Without the error (e⟂ᵀ r)²/|e⟂|² is χ²(1); with it, its size is −e⟂ᵀ r/|e⟂|²,
+    and the estimate is wrong by N Jᵀ e times this size. Source of this score test: Rao, "Large sample tests of
+    statistical hypotheses", Proc. Camb. Phil. Soc. 44, 1948.
+    """
+    more, x, new = parameters.with_errors(z[:-1])
+    dynamics = parameters.dynamics(parameters.values(z[:-1]))
+    clock = np.concatenate([stretched(each, dynamics) / s for each, s in zip(rows, sd)])
+    r = np.concatenate([residual(each, dynamics, float(z[-1])) / s for each, s in zip(rows, sd)])
+    errors = np.column_stack([information_root(more, rows, sd, np.append(x, z[-1]))[:, :-1][:, new], clock])
+    names = [*np.array(more.coordinate_names)[new].tolist(), "clock"]
+    replaced = N @ J.T @ errors
+    rest = errors - J @ replaced
+    power, score = np.sum(rest**2, axis=0), rest.T @ r
+    power[power <= SEPARATE * np.sum(errors**2, axis=0)] = np.inf
+    sizes, statistics = -score / power, score**2 / power
+    probabilities = chi2.sf(statistics, 1)
+    shown = [k for k in np.argsort(-statistics).tolist() if probabilities[k] < SIGNIFICANCE / len(names)]
+    moved = replaced[:, shown] * np.sqrt(sizes**2 + 1.0 / power)[shown]
+    return tuple(Suspect(names[k], float(sizes[k]), float(probabilities[k])) for k in shown), moved @ moved.T
 
 
 def _misfit(rows: Rows, errors: Array, used: float) -> Misfit:

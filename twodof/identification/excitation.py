@@ -162,7 +162,7 @@ class _Design:
         rows = []
         for i, (sign, v, a, tau, tau_rate) in enumerate(signals.transpose(2, 0, 1)):
             gravity = G[:, :, i].swapaxes(0, 1)
-            rows.append(Rows(i, Y[:, i], gravity, sign, v, a, tau, tau_rate, turning[:, i], none, none, about))
+            rows.append(Rows(i, Y[:, i], gravity, sign, v, a, tau, tau_rate, turning[:, i], none, about))
         sd = [np.full(len(Y), noise) for noise in self._noise]
         J = information_root(self._parameters, rows, sd, self._z) * self._scales
         return np.asarray(np.linalg.inv(J.T @ J + PRIOR**-2 * np.eye(len(self._z)))[:-1, :-1])

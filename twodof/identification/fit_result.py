@@ -19,13 +19,21 @@ from ..files import refusing, temporary_folder
 from ..notebook import card
 from ..version import __version__
 from .curves import Curve, Table
-from .estimate import Misfit
+from .estimate import Misfit, Suspect
 from .prediction import WINDOW
 
 MOST_NAMES = 6
 """Largest number of parameters that the page names in its verdict."""
 UNEXPLAINED = 0.01
 """Slow residuals that are not noise, as a fraction of the efforts, above which the model does not explain the data."""
+ERRORS = {
+    "gravity": "a base that is tilted by {size:.2g} {unit} (free '{name}')",
+    "offset": "positions of joint '{joint}' that need {size:+.2g} {unit} (free '{name}')",
+    "gain": "efforts of joint '{joint}' that need {percent:+.2g} % (free '{name}')",
+    "clock": "speeds that need {percent:+.2g} %, because a clock is wrong",
+}
+ALIKE = 100.0
+"""Ratio of the probabilities of two errors, below which the data do not tell one from the other."""
 MOST_COMBINATIONS = 5
 """Largest number of combinations that the summary lists."""
 
@@ -65,6 +73,7 @@ class Fit:
         parameters: the free parameters.
         unseen: parameters that form each direction that the data do not determine.
         misfits: test of the model at each joint.
+        suspects: errors of the setup that the residuals show, for which the intervals are wider.
         noise: standard deviation of the efforts' residuals at each joint, N·m or N.
         delay: time from a recorded effort to its action, s, and its standard deviation.
         deviation_before, deviation: root mean square of simulated minus measured positions of each joint in the
@@ -84,6 +93,7 @@ class Fit:
     parameters: tuple[FittedParameter, ...]
     unseen: tuple[str, ...]
     misfits: tuple[Misfit, ...]
+    suspects: tuple[Suspect, ...]
     noise: tuple[float, ...]
     delay: tuple[float, float]
     deviation_before: tuple[float, ...]
@@ -97,7 +107,7 @@ class Fit:
     @property
     def explains(self) -> bool:
         """True if the residuals at all joints are noise, and the efforts do not jump between samples."""
-        return not self.jumps and not any(misfit.bad for misfit in self.misfits)
+        return not self.jumps and not self.suspects and not any(misfit.bad for misfit in self.misfits)
 
     @property
     def rows(self) -> list[tuple[str, str, str, str, str]]:
@@ -127,8 +137,10 @@ class Fit:
     @property
     def _warnings(self) -> list[str]:
         lines = []
-        if bad := [misfit for misfit in self.misfits if misfit.bad]:
+        if bad := [m for m in self.misfits if m.bad and (m.part > UNEXPLAINED or not self.suspects)]:
             lines.append(self._verdict(max(bad, key=lambda misfit: misfit.part)))
+        if self.suspects:
+            lines.append(self._suspicion())
         if not self.converged:
             lines.append("the fit has not converged: free fewer parameters, or record more motion")
         for joint, t in self.jumps.items():
@@ -157,6 +169,16 @@ class Fit:
             f" {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the variance of fast ones; free"
             " more parameters, or look for what the URDF does not have"
         )
+
+    def _suspicion(self) -> str:
+        """Return the line on the errors that the residuals show most."""
+        alike = [each for each in self.suspects if each.probability <= ALIKE * self.suspects[0].probability]
+        found = []
+        for name, size, _ in alike:
+            group, _, joint = name.partition(":")
+            unit = self.units[self.joints.index(joint)] if joint else "rad"
+            found.append(ERRORS[group].format(name=name, joint=joint, size=size, unit=unit, percent=100 * size))
+        return f"the residuals show {', or '.join(found)}; the intervals allow for it: correct it"
 
     def _effort_unit(self, joint: int) -> str:
         return "N·m" if self.units[joint] == "rad" else "N"
@@ -187,6 +209,7 @@ class Fit:
             "converged": self.converged,
             "jumps": dict(self.jumps),
             "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
+            "suspects": [suspect._asdict() for suspect in self.suspects],
             "noise": dict(zip(self.joints, self.noise)),
             "delay": {"value": self.delay[0], "deviation": self.delay[1]},
             "held_out": {

@@ -214,6 +214,7 @@ def _result(
         parameters=tuple(_parameters(parameters, found)),
         unseen=tuple(_unseen(parameters, found)),
         misfits=found.misfits,
+        suspects=found.suspects,
         noise=tuple(found.noise.tolist()),
         delay=found.delay,
         deviation_before=compared.deviations[0],

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, NamedTuple
@@ -39,6 +40,7 @@ OF_JOINTS = {
 }
 """Units of rotating and of sliding joints."""
 OF_THE_ROBOT = ("payload", "payload_com", "gravity")
+OF_THE_SETUP = ("gravity", "offset", "gain")
 EXPONENTS, BOUNDED = ("mass", "gain"), ("friction", "damping", "armature", "payload")
 """Groups of values exp(x), and groups of values that are at least 0."""
 SIZES = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}
@@ -132,7 +134,6 @@ class Parameters:
         given, start: values of all parameters in the URDF, and the start values of the coordinates.
         free: the free parameters.
         names, units: names and units of their values.
-        coordinate_names: names of their coordinates, without the axes.
 
     Args:
         urdf, robot: the robot, read.
@@ -181,7 +182,20 @@ class Parameters:
         self._settle()
         self.names = tuple(name for free in self.free for name in free.names)
         self.units = tuple(unit for free in self.free for unit in free.units)
-        self.coordinate_names = tuple(_of_all(free) for free in self.free for _ in range(free.size))
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Names of the coordinates, without the axes."""
+        return tuple(_of_all(free) for free in self.free for _ in range(free.size))
+
+    def with_errors(self, x: Array) -> tuple[Parameters, Array, NDArray[np.bool_]]:
+        """Free gravity, offsets and gains, too; return these parameters, coordinates, and which of them are new."""
+        more = copy(self)
+        more.free = [free for _, free in self._known() if free in self.free or free.group in OF_THE_SETUP]
+        new = np.concatenate([np.full(free.size, free not in self.free) for free in more.free])
+        coordinates = np.zeros(len(new))
+        coordinates[~new] = x
+        return more, coordinates, new
 
     def _known(self) -> list[tuple[str, Free]]:
         """Return all parameters: the name that a pattern matches, and the parameters."""

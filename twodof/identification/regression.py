@@ -46,7 +46,6 @@ class Rows(NamedTuple):
         tau, tau_rate: recorded effort and its derivative, K.
         offsets: derivative of the inverse dynamics with respect to positions, K × n.
         bin: index of each row's frequency bin, K.
-        block: index of each row's stretch of motion, K.
         about: offsets, n, and delay of the efforts, s, at which the rows were linearised.
     """
 
@@ -60,7 +59,6 @@ class Rows(NamedTuple):
     tau_rate: Array
     offsets: Array
     bin: NDArray[np.int64]
-    block: NDArray[np.int64]
     about: tuple[Array, float]
 
 
@@ -95,7 +93,7 @@ def rows_of(
 ) -> list[Rows]:
     """Return the rows of each joint, linearised at values of the parameters and a delay of the efforts, s."""
     found: list[list[Rows]] = [[] for _ in robot.joints]
-    block, about = 0, (values.offset, delay)
+    about = (values.offset, delay)
     for stretch in stretches:
         Y, G = regressors(robot, stretch, values.offset)
         turning = position_derivatives(robot, values, stretch, with_offsets)
@@ -119,15 +117,13 @@ def rows_of(
                 bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
                 gravity = parts[1].reshape(keep, 3, size).transpose(1, 0, 2)
                 sign, v, a, tau, tau_rate = parts[3].T
-                blocks = np.full(keep, block)
-                rows.append(Rows(i, parts[0], gravity, sign, v, a, tau, tau_rate, parts[2], bins, blocks, about))
-                block += 1
+                rows.append(Rows(i, parts[0], gravity, sign, v, a, tau, tau_rate, parts[2], bins, about))
     return [_joined(rows) for rows in found]
 
 
 def _joined(rows: list[Rows]) -> Rows:
     """Return the rows of all stretches of a joint as one."""
-    names = ("Y", "G", "sign", "v", "a", "tau", "tau_rate", "offsets", "bin", "block")
+    names = ("Y", "G", "sign", "v", "a", "tau", "tau_rate", "offsets", "bin")
     parts: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in rows], axis=int(name == "G")) for name in names
     }
@@ -209,3 +205,10 @@ def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
         columns += np.outer(column, getattr(rates, group)[i])
     columns -= np.outer(modelled(rows, values) / gain, rates.gain[i])
     return np.column_stack([-columns / gain, -rows.tau_rate])
+
+
+def stretched(rows: Rows, values: Dynamics) -> Array:
+    """Return the derivative of ``residual`` with respect to the part by which speeds are too low, by a wrong clock."""
+    i = rows.joint
+    twice = rows.Y @ values.inertial + values.armature[i] * rows.a
+    return np.asarray(-(2.0 * twice + values.damping[i] * rows.v) / values.gain[i])
