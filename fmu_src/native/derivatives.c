@@ -1,7 +1,6 @@
 /* Directional and adjoint derivatives. The first direction at a point costs one complex evaluation. The second
    direction at the same point computes the Jacobian of the accelerations; each further direction is a product with it.
    If the previous point had several directions, the first direction already computes the Jacobian. */
-#include <float.h>
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
@@ -105,16 +104,10 @@ static void add_column(const Instance *instance, int k, double change, double ra
         rate[N_JOINTS + r] += instance->slope[k][r] * change;
 }
 
-/* True if all references are values from first to before end, in total as many as there are values. */
-static int are_within(const Reference vr[], size_t count, int first, int end, const double value[], size_t n_values)
+/* True if a reference is that of values from first to before end, at most as many as there are. */
+static int is_within(Reference vr, int first, int end, size_t n_values)
 {
-    size_t n = 0;
-    for (size_t i = 0; i < count && vr; i++) {
-        if ((FMI == 3 && vr[i] - 1 >= N_REFERENCES) || begin_of(vr[i]) < first || begin_of(vr[i]) >= end)
-            return 0;
-        n += size_of(vr[i]);
-    }
-    return vr && value && n == n_values;
+    return (FMI == 2 || vr - 1 < N_REFERENCES) && begin_of(vr) >= first && begin_of(vr) < end && size_of(vr) <= n_values;
 }
 
 /* Compute the derivatives of rates, if they are products with a known Jacobian. Return 0 if the request needs anything
@@ -122,23 +115,24 @@ static int are_within(const Reference vr[], size_t count, int first, int end, co
 static int multiply(Instance *instance, const Request *request, const double seed[], size_t n_seed,
                     double result[], size_t n_result)
 {
-    const int first = COMMANDS_ACCELERATION ? TAU_EXT : 0;
-    double rate[N_STATES] = {0};
-    int are_finite = 1;
-    if (!(instance->state.has_rates & SLOPES)
-        || !are_within(request->unknown, request->n_unknown, DER_Q, END_OF_RATES, result, n_result)
-        || !are_within(request->given, request->n_given, first, X, seed, n_seed))
+    const Reference *unknown = request->unknown, *given = request->given;
+    double rate[N_STATES] = {0}, zero = 0.0; /* NaN after a value that is not finite */
+    if (!(instance->state.has_rates & SLOPES) || !unknown || !given || !seed || !result)
         return 0;
-    instance->asks_several = 1;
-    for (size_t i = 0; i < request->n_given; i++)
-        for (int k = begin_of(request->given[i]); k < end_of(request->given[i]); k++)
+    for (size_t i = 0; i < request->n_given; n_seed -= size_of(given[i++])) {
+        if (!is_within(given[i], COMMANDS_ACCELERATION ? TAU_EXT : 0, X, n_seed))
+            return 0;
+        for (int k = begin_of(given[i]); k < end_of(given[i]); k++)
             add_column(instance, k, *seed++, rate);
-    for (size_t i = 0; i < request->n_unknown; i++)
-        for (int k = begin_of(request->unknown[i]); k < end_of(request->unknown[i]); k++) {
-            *result++ = rate[k - DER_Q];
-            are_finite &= fabs(rate[k - DER_Q]) <= DBL_MAX;
-        }
-    return are_finite;
+    }
+    for (size_t i = 0; i < request->n_unknown; n_result -= size_of(unknown[i++])) {
+        if (!is_within(unknown[i], DER_Q, END_OF_RATES, n_result))
+            return 0;
+        for (int k = begin_of(unknown[i]); k < end_of(unknown[i]); k++)
+            zero += 0.0 * (*result++ = rate[k - DER_Q]);
+    }
+    instance->asks_several = 1;
+    return zero == 0.0 && n_seed == 0 && n_result == 0;
 }
 
 /* Check a request and its seed, and update the state. Return 0 if a variable has no derivative or the seed is not

@@ -37,8 +37,35 @@ static void add_products(Matrix M, double b[X][N_JOINTS], int first, int end, do
     }
 }
 
-/* Add the weighted rows of ∂ID by q and v to slope. */
-static void add_inverse_dynamics(const JointMotion motion[N_BODIES], const JointForce force[N_BODIES],
+/* Compute the terms of all joints, from the last one inwards. */
+static void joint_forces(JointTerms *terms, const EndBody *end_body, const JointMotion motion[N_BODIES],
+                         JointForce force[N_BODIES])
+{
+    enum { SIZE = sizeof(Load) / sizeof(double) };
+    Load beyond[N_BODIES] = {{0}}, load;
+    for (int i = N_BODIES; i-- > 0;) {
+        terms(LOADED[i] < 0 ? &BODY[i] : &end_body[LOADED[i]], &motion[i], &beyond[i], &load, &force[i]);
+        for (int k = 0; k < SIZE && PARENT[i] >= 0; k++)
+            ((double *)&beyond[PARENT[i]])[k] += ((double *)&load)[k];
+    }
+}
+
+/* Change χ and the accelerations to those at rest without gravity. */
+static void bring_to_rest(const double a[N_JOINTS], JointMotion motion[N_BODIES])
+{
+    static const double root[6];
+    for (int i = 0; i < N_BODIES; i++) {
+        JointMotion *m = &motion[i];
+        const double *before = PARENT[i] < 0 ? root : motion[PARENT[i]].acceleration;
+        memset(m->chi, 0, sizeof m->chi);
+        add_motion_cross(before, m->s, 1.0, m->chi);
+        for (int k = 0; k < 6; k++)
+            m->acceleration[k] = before[k] + m->s[k] * a[LEADER[i]];
+    }
+}
+
+/* Add the weighted rows of ∂ID by q and, unless at rest, v to slope. */
+static void add_inverse_dynamics(const JointMotion motion[N_BODIES], const JointForce force[N_BODIES], int at_rest,
                                  const double weight[N_JOINTS], double slope[X][N_JOINTS])
 {
     for (int i = 0; i < N_BODIES; i++)
@@ -47,11 +74,13 @@ static void add_inverse_dynamics(const JointMotion motion[N_BODIES], const Joint
             const JointMotion *m = &motion[j];
             const int r = LEADER[i], c = LEADER[j];
             slope[Q + c][r] += weight[r] * (2.0 * dot_of(f->coriolis, m->psi, 3) + dot_of(f->inertial, m->chi, 6));
-            slope[V + c][r] += weight[r] * 2.0 * (dot_of(f->coriolis, m->s, 3) + dot_of(f->inertial, m->psi, 6));
-            if (i == j)
+            if (i != j)
+                slope[Q + r][c] += weight[c] * dot_of(f->by_q, m->s, 6);
+            if (at_rest)
                 continue;
-            slope[Q + r][c] += weight[c] * dot_of(f->by_q, m->s, 6);
-            slope[V + r][c] += weight[c] * dot_of(f->by_v, m->s, 6);
+            slope[V + c][r] += weight[r] * 2.0 * (dot_of(f->coriolis, m->s, 3) + dot_of(f->inertial, m->psi, 6));
+            if (i != j)
+                slope[V + r][c] += weight[c] * dot_of(f->by_v, m->s, 6);
         }
 }
 
@@ -134,8 +163,8 @@ static void add_law(const double value[N_VARIABLES], const JointPosition joint[N
     Matrix M;
     body(value, 1, known);
     joint_motions(joint, &value[V], given, &value[GRAVITY], motion);
-    joint_forces(known, motion, force);
-    add_inverse_dynamics(motion, force, acts, slope);
+    joint_forces(joint_force, known, motion, force);
+    add_inverse_dynamics(motion, force, 0, acts, slope);
     add_command(value, joint, stops, first, given, motion, change);
     mass_matrix(joint, known, &value[ARMATURE], M);
     for (int i = 0; i < N_JOINTS; i++)
@@ -183,7 +212,7 @@ static int set_efforts(const double value[N_VARIABLES], const JointPosition join
                        const EndBody *end_body, int first, double a[N_JOINTS], double acts[N_JOINTS],
                        double slope[X][N_JOINTS], double effort[X][N_JOINTS])
 {
-    const double *v = &value[V], nothing[N_JOINTS + 3] = {0};
+    const double *v = &value[V];
     double given[N_JOINTS], minus[N_JOINTS];
     JointMotion motion[N_BODIES];
     JointForce force[N_BODIES];
@@ -205,9 +234,12 @@ static int set_efforts(const double value[N_VARIABLES], const JointPosition join
         a[i] -= given[i];
     }
     if (moves) {
-        joint_motions(joint, cancels ? nothing : v, a, cancels ? nothing : &value[GRAVITY], motion);
-        joint_forces(end_body, motion, force);
-        add_inverse_dynamics(motion, force, minus, effort);
+        if (cancels)
+            bring_to_rest(a, motion);
+        else
+            joint_motions(joint, v, a, &value[GRAVITY], motion);
+        joint_forces(cancels ? joint_force_at_rest : joint_force, end_body, motion, force);
+        add_inverse_dynamics(motion, force, cancels, minus, effort);
     }
     return add_external_force(&value[F_EXT], motion, effort) || moves;
 }

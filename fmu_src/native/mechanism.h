@@ -29,9 +29,9 @@ typedef struct {
 #endif
 } TaskFrame;
 
-/* The body that carries the task frame, with its payload: mass, mass times centre, and inertia
-   about the frame of its joint: xx, xy, yy, xz, yz, zz. Where links have inertias that are inputs, it is the first of an
-   array, and the others are the bodies that depend on these. */
+/* A body; the end body carries the task frame, with its payload: mass, mass times centre, and inertia
+   about the frame of its joint: xx, xy, yy, xz, yz, zz. Where links have inertias that are inputs, the end body is the
+   first of an array, and the others are the bodies that depend on these. */
 typedef struct {
     double mass, moment[3], inertia[6];
 } EndBody;
@@ -98,10 +98,39 @@ typedef struct {
     double coriolis[3], inertial[6], by_q[6], by_v[6];
 } JointForce;
 
+/* Of all bodies that a joint moves: mass, first moment, inertia, momentum, Coriolis matrix and wrench. */
+typedef struct {
+    double mass, moment[3], inertia[6], p[3], B[3][3], f[6];
+} Load;
+
 #ifndef IS_COMPLEX
 INTERNAL void joint_motions(const JointPosition joint[N_BODIES], const double v[N_JOINTS], const double a[N_JOINTS],
                             const double gravity[3], JointMotion motion[N_BODIES]);
-INTERNAL void joint_forces(const EndBody *end_body, const JointMotion motion[N_BODIES], JointForce force[N_BODIES]);
+
+/* Compute a joint's terms and load by its body and the load beyond it; the second one for motions at rest. */
+typedef void JointTerms(const EndBody *body, const JointMotion *motion, const Load *beyond, Load *load,
+                        JointForce *force);
+INTERNAL JointTerms joint_force, joint_force_at_rest;
+
+static inline void cross(const double a[3], const double b[3], double result[3])
+{
+    result[0] = a[1] * b[2] - a[2] * b[1];
+    result[1] = a[2] * b[0] - a[0] * b[2];
+    result[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* sum += factor (m × s) of two spatial motions. */
+static inline void add_motion_cross(const double m[6], const double s[6], double factor, double sum[6])
+{
+    double angular[3], linear[3], further[3];
+    cross(m, s, angular);
+    cross(m, s + 3, linear);
+    cross(m + 3, s, further);
+    for (int k = 0; k < 3; k++) {
+        sum[k] += factor * angular[k];
+        sum[3 + k] += factor * (linear[k] + further[k]);
+    }
+}
 
 /* M(q), with the armature. */
 INTERNAL void mass_matrix(const JointPosition joint[N_BODIES], const EndBody *end_body,

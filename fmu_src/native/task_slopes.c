@@ -16,26 +16,6 @@ typedef struct {
     Matrix turned;
 } TaskSlopes;
 
-static void cross(const double a[3], const double b[3], double result[3])
-{
-    result[0] = a[1] * b[2] - a[2] * b[1];
-    result[1] = a[2] * b[0] - a[0] * b[2];
-    result[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-/* sum += factor (m × s) of two spatial motions. */
-static void add_motion_cross(const double m[6], const double s[6], double factor, double sum[6])
-{
-    double angular[3], linear[3], further[3];
-    cross(m, s, angular);
-    cross(m, s + 3, linear);
-    cross(m + 3, s, further);
-    for (int k = 0; k < 3; k++) {
-        sum[k] += factor * angular[k];
-        sum[3 + k] += factor * (linear[k] + further[k]);
-    }
-}
-
 /* sum += a × b. */
 static void add_cross(const double a[3], const double b[3], double sum[3])
 {

@@ -14,7 +14,6 @@ dynamics using spatial vector algebra", IEEE RA-L 7(2), 2022, for joints of one 
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -51,34 +50,30 @@ def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: A
     return [*map(np.array, zip(*motions)), np.array(rotations), np.array(origins)]
 
 
-def joint_forces(robot: JointTree, body: Sequence[Body], motions: Sequence[Array]) -> list[Array]:
-    """Return for each joint Bᵀs (N × 3: its linear part is 0), I s, and the two wrenches in brackets above (N × 6).
+Load = tuple[Body, Array, Array, Array]
+"""Of bodies: themselves in the root's axes, their momentum p, the angular block of B, and f."""
 
-    The wrenches of joints at the root are 0. For a body with the momentum p, the first moment d and the inertia J about
-    the origin, B maps an angular velocity w to the moment and the force
+
+def joint_force(body: Body, motions: Sequence[Array], beyond: Load) -> tuple[Load, list[Array]]:
+    """Return the load of a joint, and its terms: Bᵀs (its linear part is 0), I s, and the two wrenches above.
+
+    For a body with the momentum p, the first moment d and the inertia J about the origin, B maps an angular velocity w
+    to the moment and the force
 
         ω × (J − tr J/2) w − d × (v × w),   w × p
     """
-    s, psi, chi, velocity, acceleration, rotations, origins = motions
-    sums: list[list[Any]] = []  # of bodies: body, p, B and f
-    for b, R, o, m, a in zip(body, rotations, origins, velocity, acceleration):
-        b, omega, linear = b.moved(R, o), m[:3], m[3:]
-        J, d, p = b.inertia, b.moment, _inertial(b, m)[3:]
-        half = J - np.eye(3) * (0.5 * (J[0, 0] + J[1, 1] + J[2, 2]))
-        B = np.array([cross(omega, column) for column in half]).T - np.outer(linear, d) + np.eye(3) * d.dot(linear)
-        sums.append([b, p, B, _inertial(b, a) + _coriolis(B, p, omega)])
-    terms = []
-    for i in reversed(range(len(robot.parent))):
-        (b, p, B, f), parent = sums[i], robot.parent[i]
-        by_q = by_v = np.zeros(6)
-        if parent >= 0:
-            sums[parent] = [whole + part for whole, part in zip(sums[parent], sums[i])]
-            z, linear = s[i][:3], s[i][3:]
-            crossed = np.array([*(cross(z, f[:3]) + cross(linear, f[3:])), *cross(z, f[3:])])
-            by_q = _coriolis(B, p, psi[i]) * 2.0 + _inertial(b, chi[i]) + crossed
-            by_v = (_coriolis(B, p, s[i]) + _inertial(b, psi[i])) * 2.0
-        terms.append((B.T.dot(s[i][:3]) + cross(p, s[i][3:]), _inertial(b, s[i]), by_q, by_v))
-    return [*map(np.array, zip(*reversed(terms)))]
+    s, psi, chi, velocity, acceleration, R, origin = motions
+    own, omega, linear = body.moved(R, origin), velocity[:3], velocity[3:]
+    J, d, momentum = own.inertia, own.moment, _inertial(own, velocity)[3:]
+    half = J - np.eye(3) * (0.5 * (J[0, 0] + J[1, 1] + J[2, 2]))
+    own_B = np.array([cross(omega, column) for column in half]).T - np.outer(linear, d) + np.eye(3) * d.dot(linear)
+    wrench = _inertial(own, acceleration) + _coriolis(own_B, momentum, omega)
+    b, p, B, f = load = own + beyond[0], momentum + beyond[1], own_B + beyond[2], wrench + beyond[3]
+    z, linear = s[:3], s[3:]
+    crossed = np.array([*(cross(z, f[:3]) + cross(linear, f[3:])), *cross(z, f[3:])])
+    by_q = _coriolis(B, p, psi) * 2.0 + _inertial(b, chi) + crossed
+    by_v = (_coriolis(B, p, s) + _inertial(b, psi)) * 2.0
+    return load, [B.T.dot(z) + cross(p, linear), _inertial(b, s), by_q, by_v]
 
 
 def _motion_cross(m: Array, s: Array) -> Array:

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
 from ..plant.robot import Robot
 from ..plant.variables import OF_LINKS, Variable
 from .bodies import Array, Body, FreeLink, JointTree, joint_tree
-from .derivatives import joint_forces, joint_motions
+from .derivatives import joint_force, joint_motions
 from .recursions import (
     effort_bounds,
     hybrid_by_factors,
@@ -65,14 +66,13 @@ def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[Fr
     texts += _forward_dynamics(constants, bodies, joint, armature, in_all, held)
     texts += ["#ifndef IS_COMPLEX", _tree(constants, rows[: len(robot.axes)])]
     motions = joint_motions(constants, joint, v, a, gravity)
-    terms = _terms("motion", ("s", "psi", "chi", "velocity", "acceleration", "R", "origin"), motions)
-    computed = iter(Expression(name) if isinstance(value, Expression) else value for name, value in terms.items())
-    motions = [np.array([next(computed) for _ in rows.flat], dtype=object).reshape(rows.shape) for rows in motions]
+    s, psi, chi, velocity, *others = motions
+    at_rest = [s, np.zeros(psi.shape), chi, np.zeros(velocity.shape), *others]
+    fields = [f"motion[{i}].{field}" for field in MOTION for i in range(len(bodies))]
     derived = {
-        f"joint_motions({in_all}, {moved}, JointMotion motion[N_BODIES])": terms,
-        "joint_forces(const EndBody *end_body, const JointMotion motion[N_BODIES], JointForce force[N_BODIES])": _terms(
-            "force", ("coriolis", "inertial", "by_q", "by_v"), joint_forces(constants, bodies, motions)
-        ),
+        f"joint_motions({in_all}, {moved}, JointMotion motion[N_BODIES])": _named(fields, [*chain(*motions)]),
+        f"joint_force({ONE_JOINT})": _joint_force(bodies, motions),
+        f"joint_force_at_rest({ONE_JOINT})": _joint_force(bodies, at_rest),
         f"mass_matrix({in_all}, {INERTIAS}, double M[N_JOINTS][N_JOINTS])": _elements(
             "M", mass_matrix(constants, bodies, joint, armature)
         ),
@@ -82,20 +82,42 @@ def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[Fr
 
 
 def _tree(robot: JointTree, axes: Sequence[int]) -> str:
-    """Return the joints' parents, of each the independent joint that it follows, and the task's axes."""
-    rows = {"PARENT": robot.parent, "LEADER": np.abs(robot.G).argmax(axis=1)}
+    """Return the joints' parents, of each the independent joint that it follows, the bodies, and the task's axes."""
+    count = np.cumsum([i != robot.path[-1] and _varies(body) for i, body in enumerate(robot.body)])
+    loaded = [0 if i == robot.path[-1] else int(count[i]) if _varies(body) else -1 for i, body in enumerate(robot.body)]
+    rows = {"PARENT": robot.parent, "LEADER": np.abs(robot.G).argmax(axis=1), "LOADED": loaded}
     lines = [f"static const int {name}[N_BODIES] = {{{', '.join(map(str, row))}}};" for name, row in rows.items()]
+    parts = [[", ".join(map(_constant, part.flat)) for part in _parts(body)] for body in robot.body]
+    constants = ", ".join(f"{{{mass}, {{{moment}}}, {{{inertia}}}}}" for mass, moment, inertia in parts)
+    lines.append(f"static const EndBody BODY[N_BODIES] = {{{constants}}};")
     lines.append(f"static const int AXIS[N_AXES] = {{{', '.join(map(str, axes))}}};")
     return "\n".join([*lines, f"enum {{ END_BODY = {robot.path[-1]} }};"])
 
 
-def _terms(name: str, fields: Sequence[str], values: Sequence[Array]) -> dict[str, Value]:
-    """Return the elements of the fields of an array of structs."""
-    return {
-        f"{name}[{i}].{field}" + "".join(f"[{k}]" for k in index): each
-        for field, rows in zip(fields, values)
-        for (i, *index), each in np.ndenumerate(rows)
-    }
+def _constant(value: Value) -> str:
+    """Return a constant in C; the values of a body that varies are not read."""
+    return "0.0" if isinstance(value, Expression) else repr(float(value))
+
+
+def _joint_force(bodies: Sequence[Body], motions: Sequence[Array]) -> dict[str, Value]:
+    """Return the load and the terms of any joint by their names in C; constants that all joints have are folded."""
+    body = _body_of(*(_common(f"body->{part}", rows) for part, rows in zip(BODY, zip(*map(_parts, bodies)))))
+    motion = [_common(f"motion->{field}", [*rows]) for field, rows in zip(MOTION, motions)]
+    nothing = Body(0.0, np.zeros(3), np.zeros((3, 3))), np.zeros(3), np.zeros((3, 3)), np.zeros(6)
+    loads = [_parts(*load) for load in (nothing, joint_force(body, motion, nothing)[0])]
+    *inertial, p, B, f = (_common(f"beyond->{part}", rows) for part, rows in zip(LOAD, zip(*loads)))
+    load, terms = joint_force(body, motion, (_body_of(*inertial), p, B, f))
+    names = [*(f"load->{part}" for part in LOAD), *(f"force->{term}" for term in FORCE)]
+    return _named(names, [*_parts(*load), *terms])
+
+
+def _common(name: str, rows: Sequence[Array]) -> Array:
+    """Return the constants that several arrays have in common, and variables for their other elements."""
+    common = np.array(rows[0], dtype=object)
+    for variable, index in zip(_elements(name, common), np.ndindex(common.shape)):
+        if any(isinstance(row[index], Expression) or row[index] != common[index] for row in rows):
+            common[index] = Expression(variable)
+    return common
 
 
 def _forward_dynamics(
@@ -138,6 +160,7 @@ MECHANISM = """\
 INERTIAS = "const EndBody *end_body, const double armature[N_JOINTS]"
 LOAD_END_BODY = "load_end_body(double payload, const double offset[3]"
 LOAD_BODIES = "load_bodies(double payload, const double offset[3], const double link[N_LINK_VALUES]"
+ONE_JOINT = "const EndBody *body, const JointMotion *motion, const Load *beyond, Load *load, JointForce *force"
 END_BODY = ("end_body->", "payload", "offset[")
 OF_PARAMETER = {
     **{"armature": ("armature[",), "gravity": ("gravity[",), "payload": END_BODY, "payload_com": END_BODY},
@@ -145,6 +168,10 @@ OF_PARAMETER = {
 }
 """The C variables of parameters, with respect to which there are derivatives only if they are inputs."""
 LOWER = np.tril_indices(3)
+MOTION, FORCE = ("s", "psi", "chi", "velocity", "acceleration", "R", "origin"), ("coriolis", "inertial", "by_q", "by_v")
+BODY = ("mass", "moment", "inertia")
+LOAD = (*BODY, "p", "B", "f")
+"""Fields of structs in C."""
 
 
 def _solution(solution: Array, inertial: Array, held: Sequence[str]) -> list[Varied]:
@@ -183,16 +210,27 @@ def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
         body = loaded if i == end_body else body
         values: dict[str, Value] = {f"{name}mass": body.mass}
         values |= _elements(f"{name}moment", body.moment) | _elements(f"{name}inertia", body.inertia[LOWER])
-        varying = {key: value for key, value in values.items() if i == end_body or isinstance(value, Expression)}
-        if not varying:
+        if i != end_body and not _varies(body):
             continue
-        ten = [Expression(key) if key in varying else value for key, value in values.items()]
-        inertia = np.zeros((3, 3), dtype=object)
-        inertia[LOWER] = inertia.T[LOWER] = ten[4:]
-        bodies[i] = Body(ten[0], np.array(ten[1:4], dtype=object), inertia)
-        load |= varying
+        ten = [Expression(k) if i == end_body or isinstance(v, Expression) else v for k, v in values.items()]
+        bodies[i] = _body_of(np.array(ten[0]), np.array(ten[1:4], dtype=object), np.array(ten[4:], dtype=object))
+        load |= values
         count += i != end_body
     return bodies, load
+
+
+def _varies(body: Body) -> bool:
+    return any(isinstance(value, Expression) for part in _parts(body) for value in part.flat)
+
+
+def _parts(body: Body, *others: Array) -> list[Array]:
+    return [np.array(body.mass), body.moment, body.inertia[LOWER], *others]
+
+
+def _body_of(mass: Array, moment: Array, lower: Array) -> Body:
+    inertia = np.zeros((3, 3), dtype=object)
+    inertia[LOWER] = inertia.T[LOWER] = lower
+    return Body(mass.item(), moment, inertia)
 
 
 def _variables(name: str, count: int) -> Array:
@@ -202,3 +240,8 @@ def _variables(name: str, count: int) -> Array:
 def _elements(name: str, values: Array) -> dict[str, Value]:
     """Return each element of an array by its name in C."""
     return {name + "".join(f"[{i}]" for i in index): value for index, value in np.ndenumerate(values)}
+
+
+def _named(names: Sequence[str], arrays: Sequence[Array]) -> dict[str, Value]:
+    """Return the elements of several arrays by their names in C."""
+    return {name: value for each in map(_elements, names, arrays) for name, value in each.items()}
