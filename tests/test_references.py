@@ -74,6 +74,16 @@ def test_the_files_have_the_form_of_the_standards(built: Path) -> None:
         lxml.etree.XMLSchema(file=str(schema)).assertValid(lxml.etree.fromstring(files[f"{FOLDER}{name}.ssv"]))
 
 
+def test_parameters_that_are_inputs_have_the_values_of_their_experiment(tmp_path: Path) -> None:
+    free = ("payload", "payload_com", "armature", "damping", "mass:link2")
+    options = twodof.FmuOptions(native=True, reference=True, free=free)
+    found = rows(twodof.build_fmu(tmp_path / "arm.fmu", options))
+    assert {name: row.outcome for name, row in found.items()} == {
+        "reference move": "passed",
+        "reference push": "passed",
+    }
+
+
 def test_builds_are_identical_and_references_come_and_go(tmp_path: Path, native_path: Path, built: Path) -> None:
     options = twodof.FmuOptions(native=True, reference=True)
     again = twodof.build_fmu(tmp_path / "arm.fmu", options)

@@ -71,13 +71,17 @@ def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[st
             for key, value in change.items():
                 _set(plant, names[key], value)
             plant.initialise()
-        stimuli = _stimuli(plant, names, name == "push")
+        stimuli = _stimuli(plant, names, values, name == "push")
         found = [_solve(plant, names, stimuli, method, tolerance) for method, tolerance in SOLVERS.items()]
         tolerance, exact = _tolerance(plant, stimuli, found)
         times: Array = STEP * np.arange(STEPS + 1, dtype=np.float64)
         files[f"{name}-in.csv"] = _csv(times, stimuli)
         files[f"{name}-ref.csv"] = _csv(times[ROWS], {key: column[ROWS] for key, column in found[0].items()})
-        texts = {n: str(value).lower() if isinstance(value, bool) else f"{value:.9g}" for n, value in values.items()}
+        texts = {
+            n: str(value).lower() if isinstance(value, bool) else f"{value:.9g}"
+            for n, value in values.items()
+            if n not in stimuli
+        }
         files[f"{name}.ssv"] = parameter_set(name, ((n, names[n].type, value) for n, value in texts.items()))
         text = f"{', '.join(exact)} in closed form, the rest by" if exact else "by"
         described = f"references: {text} two solvers; deviations are of a variable's largest magnitude, or of 1"
@@ -119,7 +123,7 @@ def _load(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool
     }
 
 
-def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns:
+def _stimuli(plant: Plant, names: Mapping[str, Variable], given: Mapping[str, float | bool], push: bool) -> Columns:
     """Return the inputs at each communication point, STEPS + 1 values each, rounded as in the file."""
     n, q, blocks = len(plant.q), np.array(plant.q), STEPS // HOLD
     swing, x = SWING * (-1.0) ** np.arange(n), np.array(plant.x)
@@ -147,7 +151,8 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns
     for name, variable in names.items():
         if variable.causality == "input":
             group = inputs.get(variable.group)
-            values = np.full(STEPS + 1, variable.start, float) if group is None else group[:, variable.index]
+            held = given.get(name, variable.start)  # parameters may be inputs
+            values = np.full(STEPS + 1, held, float) if group is None else group[:, variable.index]
             if push and variable.group.startswith(("Kp", "Kd")):
                 values *= 1.0 + (variable.index or 0) / 10.0
             columns[name] = np.array([float(f"{value:.9g}") for value in values])
