@@ -19,6 +19,7 @@ import fmpy.build
 import numpy as np
 import pytest
 from harness import in_child_process, wine
+from native_models import robots_folder
 from tools import needs
 
 import twodof
@@ -200,7 +201,7 @@ def drive(
     library = shutil.copy(unzipped / BINARIES[platform], folder)
     guid, references = variables(unzipped)
     first, last = references["q[1]"], references["tau[2]"]
-    arguments = [guid, str(first), str(last - first + 1)]
+    arguments = [guid, str(first), str(last - first + 1), str(references["der(v[1])"]), str(references["q[1]"])]
     for name, value in settings.items():
         arguments += [str(references[name]), repr(value)]
     name = Path(library).name if windows else str(library)
@@ -250,7 +251,7 @@ def test_windows_library_runs_as_linux_library(control, machines, tmp_path):
         assert not any(run.returncode for run in runs), [run.stderr for run in runs]
         linux, windows = (np.array([line.split() for line in run.stdout.splitlines()], float) for run in runs)
         assert linux.shape == windows.shape and len(linux) == 51
-        assert np.abs(windows - linux).max() <= 1e-12
+        np.testing.assert_allclose(windows, linux, rtol=1e-12, atol=1e-12)
         assert np.ptp(linux[:, :2], axis=0).min() > 0.0
     limits = [value for name, value in settings.items() if name[:5] in ("q_min", "q_max")]
     assert np.isin(limits, linux[:, :2]).all()  # they were met
@@ -258,6 +259,22 @@ def test_windows_library_runs_as_linux_library(control, machines, tmp_path):
     for run in refused:
         assert run.returncode == 4 and "payload = -1e+18 must be >= 0\n" in run.stderr
     assert refused[1].stderr.replace("\r", "") == refused[0].stderr
+
+
+def test_a_windows_library_with_more_than_a_page_of_local_variables_runs_as_linux_library(machines, tmp_path):
+    needs("ziglang")
+    folder, wine = machines
+    panda = robots_folder() / "panda_description/urdf/panda.urdf"
+    fingers, start = {"panda_finger_joint*": 0.0}, (0.0, -0.6, 0.0, -1.9, 0.0, 1.6, 0.7)
+    robot = {"name": "TwoDof", "frame": "panda_hand_tcp", "lock": fingers, "q_start": start, "meshes": False}
+    chosen = FmuOptions(panda, **robot, native=True, control="pose", platforms=("linux64", "win64"))
+    unzipped = Path(fmpy.extract(build_fmu(tmp_path / "TwoDof.fmu", chosen), tmp_path / "fmu"))
+    moved = {"x_des[1]": 0.4, "x_des[2]": 0.2, "x_des[3]": 0.5, "payload": 0.5}
+    runs = [drive(unzipped, kind, folder, moved, wine) for kind in ("linux64", "win64")]
+    assert not any(run.returncode for run in runs), [run.stderr for run in runs]
+    linux, windows = (np.array([line.split() for line in run.stdout.splitlines()], float) for run in runs)
+    assert linux.shape == windows.shape and len(linux) == 51 and np.ptp(linux[:, 0]) > 0.0
+    np.testing.assert_allclose(windows, linux, rtol=1e-9, atol=1e-9)
 
 
 def outputs(fmu: Path, **named) -> np.ndarray:

@@ -34,7 +34,7 @@ JointPosition turn(double angle)
     const double c =
         1.0 - (0.5 * z - w * (1.0 / 24 - z * (1.0 / 720) + w * (1.0 / 40320 - z * (1.0 / 3628800)
         + w * (1.0 / 479001600 - z * (1.0 / 87178291200) + w * (1.0 / 20922789888000)))));
-    const int quarters = isnan(RE(k)) ? 0 : (int)RE(k);
+    const int quarters = RE(k) == RE(k) ? (int)RE(k) : 0; /* mingw's isnan traps where double is complex */
     const double sign = quarters & 2 ? -1.0 : 1.0;
     const JointPosition even = {sign * c, sign * s}, odd = {-sign * s, sign * c};
     return quarters & 1 ? odd : even;

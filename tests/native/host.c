@@ -1,8 +1,8 @@
 /* A minimal importer of an FMU's library, for Linux and Windows.
 
-   host LIBRARY GUID FIRST COUNT [REFERENCE VALUE]...
+   host LIBRARY GUID FIRST COUNT UNKNOWN KNOWN [REFERENCE VALUE]...
    sets the values, runs 500 steps of 10 ms and prints, at the start and every 10 steps, the COUNT
-   variables from value reference FIRST on. */
+   variables from value reference FIRST on, and the derivatives of UNKNOWN by KNOWN and by the next one. */
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -58,7 +58,7 @@ static void check(fmi2Status status, const char *call)
 int main(int argc, char **argv)
 {
     static const fmi2CallbackFunctions callbacks = {print_message, calloc, free, NULL, NULL};
-    if (argc < 5)
+    if (argc < 7)
         return 1;
     const fmi2ValueReference first = (fmi2ValueReference)atoi(argv[3]);
     const size_t count = (size_t)atoi(argv[4]);
@@ -76,7 +76,8 @@ int main(int argc, char **argv)
         "host", fmi2CoSimulation, argv[2], "", &callbacks, fmi2False, fmi2True);
     if (!c)
         return 3;
-    for (int i = 5; i + 1 < argc; i += 2) {
+    const fmi2ValueReference unknown = (fmi2ValueReference)atoi(argv[5]);
+    for (int i = 7; i + 1 < argc; i += 2) {
         const fmi2ValueReference vr = (fmi2ValueReference)atoi(argv[i]);
         const fmi2Real value = strtod(argv[i + 1], NULL);
         CALL(fmi2SetReal, c, &vr, 1, &value);
@@ -92,6 +93,13 @@ int main(int argc, char **argv)
         CALL(fmi2GetReal, c, reference, count, output);
         for (size_t i = 0; i < count; i++)
             printf("%.17g ", output[i]);
+        for (int i = 0; i < 2; i++) {
+            const fmi2ValueReference known = (fmi2ValueReference)(atoi(argv[6]) + i);
+            const fmi2Real one = 1.0;
+            fmi2Real slope;
+            CALL(fmi2GetDirectionalDerivative, c, &unknown, 1, &known, 1, &one, &slope);
+            printf("%.17g ", slope);
+        }
         printf("\n");
     }
     CALL(fmi2Terminate, c);
