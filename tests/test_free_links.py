@@ -326,3 +326,16 @@ def test_an_impossible_free_link_is_refused(tmp_path: Path, free: str, message: 
     with pytest.raises(BuildError, match=message.replace("?", r"\?")) as error:
         twodof.build_fmu(tmp_path / "odd.fmu", twodof.FmuOptions(tmp_path / "odd.urdf", native=True, free=(free,)))
     assert "\n" not in str(error.value) and not (tmp_path / "odd.fmu").exists()
+
+
+def test_a_mass_that_the_controller_does_not_know_is_the_cause_of_a_failure(tmp_path: Path) -> None:
+    options = twodof.FmuOptions(native=True, meshes=False, free=("mass:link2", "com:link2"))
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)
+    good = twodof.simulate(fmu).verdict
+    assert good.outcome == "reached" and not good.causes
+    for settings, words in (
+        ({"mass_link2": 0.5}, "mass_link2 = 0.5: its model has 0.187"),
+        ({"com_link2": 0.1}, "com"),
+    ):
+        first = twodof.simulate(fmu, settings=settings).verdict.causes[0]
+        assert words in first.text and first.tried.startswith("with that of the model: 0.000224 m")

@@ -62,7 +62,8 @@ def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
     setup, gravity = judge.setup, judge.given("gravity")
     lawful = not judge.held.get("limit_effort") and not any(map(setup.starts.get, PERIODS))  # the effort is the law's
     efforts = len(judge.end("tau")) == len(setup.joints) or lawful
-    if not missed or setup.robot is None or not efforts or len(gravity) != 3:
+    others = any(judge.held.get(name, value) != value for name, value in setup.links.items())  # not the URDF's inertias
+    if not missed or setup.robot is None or not efforts or len(gravity) != 3 or others:
         return UNKNOWN
     known = setup.frame in setup.robot.links and {*setup.joints} <= setup.robot.joints.keys()
     sizes = {"x": len(setup.rows), "quat": 3, "q": len(setup.joints)}

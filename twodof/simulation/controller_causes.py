@@ -94,6 +94,12 @@ def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
         if own and len(real) == len(model) and (real != model).any():
             text = f"the controller's model has {name} = {point_text(model)}, the plant {name} = {point_text(real)}"
             yield Cause("load", f"{text}; set {own}{name} to that of the plant", 1.0, subject=name)
+    links = judge.setup.links
+    for group in dict.fromkeys(n.partition("[")[0] for n, start in links.items() if judge.held.get(n, start) != start):
+        elements = [name for name in links if name.partition("[")[0] == group]
+        vectors = [np.array([values[name] for name in elements]) for values in (judge.held, links)]
+        now, before = (f"{vector[0]:.4g}" if len(vector) == 1 else point_text(vector) for vector in vectors)
+        yield Cause("load", f"the controller does not know {group} = {now}: its model has {before}", 1.0, subject=group)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     usual = {name: joints[name].damping if name in joints else 0.0 for name in judge.setup.joints}
     drags = [_share(judge, d * speed) for d, speed in zip(judge.given("damping"), judge.speed)]

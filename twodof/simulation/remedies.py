@@ -86,7 +86,9 @@ def _elements(held: Mapping[str, float], group: str, value: float) -> dict[str, 
 
 def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
     """Return settings with which the controller knows a load, or without an external load, in words first."""
-    own, held = controller_prefix(judge), judge.held
+    own, held, links = controller_prefix(judge), judge.held, judge.setup.links
+    if known := {name: value for name, value in links.items() if name.partition("[")[0] == subject}:
+        return "with that of the model", known
     if subject == "payload":
         payload, _ = payloads(judge)
         known = {f"{own}payload_known": True, f"{own}payload": payload}

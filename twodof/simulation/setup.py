@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import inf
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..fmu import Fmu
 from ..plant.urdf import UNBOUNDED, RobotError, Urdf, read_urdf
+from ..plant.variables import OF_LINKS
 
 if TYPE_CHECKING:
     from ..geometry.kinematics import Kinematics
@@ -41,6 +43,7 @@ class Setup(NamedTuple):
         frame, axes: the end effector's link, and the task axes, letters of "xyz"; "" if unknown.
         step: communication step, s.
         starts: start values of all inputs and parameters.
+        links: inertial values of links that are inputs, as the controller's model has them.
     """
 
     joints: tuple[str, ...]
@@ -53,6 +56,7 @@ class Setup(NamedTuple):
     axes: str
     step: float
     starts: Mapping[str, float]
+    links: Mapping[str, float] = MappingProxyType({})
 
     def given(self, group: str, values: Mapping[str, float] | None = None) -> Array:
         """Return the elements of a vector of inputs or parameters, from start values or ``values``; empty if none."""
@@ -140,4 +144,6 @@ def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, flo
     """Return the setup of a run of an FMU with a robot."""
     found = setup(joints=fmu.joints, robot=robot, frame=fmu.frame, axes="".join(fmu.axes), step=step, starts=starts)
     units = tuple(own or fmu.variables[name].unit or "" for own, name in zip(found.units, fmu.vector("q")))
-    return found._replace(units=units)
+    inputs = (name for name, v in fmu.variables.items() if fmu.control and v.causality == "input")
+    links = {name: float(fmu.start_values[name]) for name in inputs if name.partition("_")[0] in OF_LINKS}
+    return found._replace(units=units, links=links)
