@@ -265,9 +265,17 @@ def test_a_windows_library_with_more_than_a_page_of_local_variables_runs_as_linu
     needs("ziglang")
     folder, wine = machines
     panda = robots_folder() / "panda_description/urdf/panda.urdf"
-    fingers, start = {"panda_finger_joint*": 0.0}, (0.0, -0.6, 0.0, -1.9, 0.0, 1.6, 0.7)
-    robot = {"name": "TwoDof", "frame": "panda_hand_tcp", "lock": fingers, "q_start": start, "meshes": False}
-    chosen = FmuOptions(panda, **robot, native=True, control="pose", platforms=("linux64", "win64"))
+    chosen = FmuOptions(
+        panda,
+        name="TwoDof",
+        frame="panda_hand_tcp",
+        lock={"panda_finger_joint*": 0.0},
+        q_start=(0.0, -0.6, 0.0, -1.9, 0.0, 1.6, 0.7),
+        meshes=False,
+        native=True,
+        control="pose",
+        platforms=("linux64", "win64"),
+    )
     unzipped = Path(fmpy.extract(build_fmu(tmp_path / "TwoDof.fmu", chosen), tmp_path / "fmu"))
     moved = {"x_des[1]": 0.4, "x_des[2]": 0.2, "x_des[3]": 0.5, "payload": 0.5}
     runs = [drive(unzipped, kind, folder, moved, wine) for kind in ("linux64", "win64")]
