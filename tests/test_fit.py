@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.identification import stretches
+from twodof.identification.estimate import Misfit, Suspect
 
 ARM = Path(__file__).parents[1] / "urdf" / "2dof.urdf"
 GRAVITY = (0.0, -9.81, 0.0)
@@ -109,13 +111,23 @@ def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):
     assert any("does not explain" in line and "'joint2'" in line for line in result.remarks)
 
 
+def test_an_error_that_the_residuals_look_like_hides_no_other_one(bag):
+    """A wrong mass of a link that is not free looks like wrong efforts."""
+    result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)
+    suspects = (Suspect("gain:joint2", 0.6931, 1e-9),)
+    remarks = replace(result, misfits=(Misfit(1, 0.01, 9.0, 1e-12, 0.007),), suspects=suspects).remarks
+    assert "explains these data only roughly, most at joint 'joint2'" in remarks[0]
+    assert "look like efforts of joint 'joint2' that need about +100 %" in remarks[1]
+    assert "mass or centre of a link that is not free" in remarks[1]
+
+
 @pytest.mark.parametrize(
     ("name", "size", "words"),
     [
-        ("gravity", 0.01, "a base that is tilted by "),
-        ("offset:joint2", 0.02, "positions of joint 'joint2' that need +0.0"),
-        ("gain:joint2", 0.02, "efforts of joint 'joint2' that need +"),
-        ("clock", 0.01, "speeds that need +1"),
+        ("gravity", 0.01, "a base that is tilted by about "),
+        ("offset:joint2", 0.02, "positions of joint 'joint2' that need about +0.0"),
+        ("gain:joint2", 0.02, "efforts of joint 'joint2' that need about +"),
+        ("clock", 0.01, "speeds that need about +1"),
     ],
 )
 def test_a_small_error_of_the_model_is_named_and_widens_the_intervals(name, size, words, motion, tmp_path):

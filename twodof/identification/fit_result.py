@@ -27,10 +27,10 @@ MOST_NAMES = 6
 UNEXPLAINED = 0.01
 """Slow residuals that are not noise, as a fraction of the efforts, above which the model does not explain the data."""
 ERRORS = {
-    "gravity": "a base that is tilted by {size:.2g} {unit} (free '{name}')",
-    "offset": "positions of joint '{joint}' that need {size:+.2g} {unit} (free '{name}')",
-    "gain": "efforts of joint '{joint}' that need {percent:+.2g} % (free '{name}')",
-    "clock": "speeds that need {percent:+.2g} %, because a clock is wrong",
+    "gravity": "a base that is tilted by about {size:.2g} {unit} (free '{name}')",
+    "offset": "positions of joint '{joint}' that need about {size:+.2g} {unit} (free '{name}')",
+    "gain": "efforts of joint '{joint}' that need about {percent:+.3g} % (free '{name}')",
+    "clock": "speeds that need about {percent:+.2g} %, as of a wrong clock",
 }
 ALIKE = 100.0
 """Ratio of the probabilities of two errors, below which the data do not tell one from the other."""
@@ -137,7 +137,7 @@ class Fit:
     @property
     def _warnings(self) -> list[str]:
         lines = []
-        if bad := [m for m in self.misfits if m.bad and (m.part > UNEXPLAINED or not self.suspects)]:
+        if bad := [misfit for misfit in self.misfits if misfit.bad]:
             lines.append(self._verdict(max(bad, key=lambda misfit: misfit.part)))
         if self.suspects:
             lines.append(self._suspicion())
@@ -161,7 +161,8 @@ class Fit:
     def _verdict(self, worst: Misfit) -> str:
         """Return the line on a model whose residuals are not noise, worst at one joint."""
         joint, unit = self.joints[worst.joint], self._effort_unit(worst.joint)
-        verdict = "explains these data only roughly, and the intervals are too narrow, most"
+        narrow = ", and the intervals are too narrow" * (not self.suspects)
+        verdict = f"explains these data only roughly{narrow}, most"
         if worst.part > UNEXPLAINED:
             verdict = "does not explain these data, least"
         return (
@@ -177,8 +178,13 @@ class Fit:
         for name, size, _ in alike:
             group, _, joint = name.partition(":")
             unit = self.units[self.joints.index(joint)] if joint else "rad"
-            found.append(ERRORS[group].format(name=name, joint=joint, size=size, unit=unit, percent=100 * size))
-        return f"the residuals show {', or '.join(found)}; the intervals allow for it: correct it"
+            percent = 100.0 * (math.expm1(size) if group == "gain" else size)  # a gain's coordinate is its logarithm
+            found.append(ERRORS[group].format(name=name, joint=joint, size=size, unit=unit, percent=percent))
+        return (
+            f"the residuals look like {', or '.join(found)}; if it is that, correct it: the intervals allow for it."
+            " A wrong mass or centre of a link that is not free, or a filter, can look alike, and the intervals do not"
+            " allow for these"
+        )
 
     def _effort_unit(self, joint: int) -> str:
         return "N·m" if self.units[joint] == "rad" else "N"
