@@ -111,6 +111,14 @@ def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):
     assert any("does not explain" in line and "'joint2'" in line for line in result.remarks)
 
 
+def test_uneven_stamps_are_named(motion, tmp_path):
+    q, effort = noisy(motion)
+    stamps = 10**18 + 10**7 * np.arange(len(q)) + np.random.default_rng(3).integers(-2 * 10**6, 2 * 10**6, len(q))
+    result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort, stamps), FREE, gravity=np.array(GRAVITY))
+    assert result.uneven == pytest.approx(0.2 * (2.0 / 3.0) ** 0.5, rel=0.05)
+    assert not result.explains and any("the stamps are uneven, by 16 % of a step" in line for line in result.remarks)
+
+
 def test_an_error_that_the_residuals_look_like_hides_no_other_one(bag):
     """A wrong mass of a link that is not free looks like wrong efforts."""
     result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)

@@ -218,7 +218,8 @@ def excite(
     if not SHORTEST <= seconds <= LONGEST:
         raise InputError(f"a motion of {seconds:g} s is not possible: between {SHORTEST:g} and {LONGEST:g} s")
     model = read_model(urdf, free, **options)
-    parameters, robot = model.parameters(options.get("gravity") or GRAVITY), model.robot
+    gravity = options.get("gravity")
+    parameters, robot = model.parameters(GRAVITY if gravity is None else tuple(gravity)), model.robot
     generations = _generations(seconds, len(robot.joints), len(parameters.free))
     known = model.locked.joints.values()
     own = [[j.velocity / abs(j.ratio) for j in known if j.ratio and j.leader == name] for name in robot.joints]

@@ -25,7 +25,7 @@ from .fit_result import Fit, FittedParameter, check_folder
 from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
 from .regression import regressors
-from .stretches import Array, Stretch, jumps, stretches
+from .stretches import Array, Stretch, jumps, stretches, unevenness
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -121,9 +121,9 @@ def fit(
     """
     if output is not None:
         check_folder(output)
-    model = read_model(urdf, free, **options)
+    model, gravity = read_model(urdf, free, **options), options.get("gravity")
     recordings = _recordings(bags)
-    parameters = model.parameters(options.get("gravity") or _recorded_gravity(recordings))
+    parameters = model.parameters(_recorded_gravity(recordings) if gravity is None else tuple(gravity))
     fitted, held = stretches(recordings, model.robot)
     _check_units(parameters, fitted)
     finished = _counter(progress, PASSES + 2 * len(held))
@@ -223,6 +223,7 @@ def _result(
         covariance=found.covariance,
         converged=found.converged,
         jumps=jumps(recordings, robot),
+        uneven=unevenness(recordings),
         curves=compared.curves,
     )
 

@@ -183,6 +183,19 @@ def jumps(recordings: Sequence[Recording], robot: Robot) -> dict[str, float]:
     return {joint: t for joint, (_, t) in found.items()}
 
 
+def unevenness(recordings: Sequence[Recording]) -> float:
+    """Return the largest RMS difference between the steps of a recording and their median, relative to it.
+
+    Steps of more than one and a half medians are gaps.
+    """
+    found = []
+    for recording in recordings:
+        steps = np.diff(recording.t)
+        relative = steps / np.median(steps) - 1.0
+        found.append(float(np.sqrt(np.mean(relative[relative < 0.5] ** 2))))
+    return max(found)
+
+
 def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
     """Return positions and efforts in the robot's order of joints."""
     name, own = recording.path, recording.joints
