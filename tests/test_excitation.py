@@ -117,7 +117,7 @@ def test_the_command_writes_inputs_of_a_run(motion, tmp_path, capsys, monkeypatc
         (["bag", "--design", "20"], "and not both"),
         ([], "name bags of the robot, or a motion to record with --design S"),
         (["--design", "20", "-o", "missing/excite.csv"], "cannot write 'missing/excite.csv'"),
-        (["--design", "20", "--gravity", "nan", "0", "0"], "is not finite"),
+        (["--design", "20", "--gravity", "nan", "0", "0"], "is not three finite numbers"),
         (["--design", "20", "--gravity", "0", "-999", "0"], "does not hold the robot in the middle of its range"),
     ],
 )  # fmt: skip

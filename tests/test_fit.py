@@ -114,7 +114,8 @@ def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):
 def test_uneven_stamps_are_named(motion, tmp_path):
     q, effort = noisy(motion)
     stamps = 10**18 + 10**7 * np.arange(len(q)) + np.random.default_rng(3).integers(-2 * 10**6, 2 * 10**6, len(q))
-    result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort, stamps), FREE, gravity=np.array(GRAVITY))
+    bag, array = bag_of(tmp_path / "bag", JOINTS, q, effort, stamps), np.array(GRAVITY)
+    result = twodof.fit(ARM, bag, FREE, gravity=array)  # type: ignore[arg-type]
     assert result.uneven == pytest.approx(0.2 * (2.0 / 3.0) ** 0.5, rel=0.05)
     assert not result.explains and any("the stamps are uneven, by 16 % of a step" in line for line in result.remarks)
 
@@ -246,7 +247,7 @@ def test_an_encoders_zero_a_torque_constant_and_a_tilted_base_are_found(motion, 
 def test_a_bag_that_is_given_twice_is_refused(bag):
     with pytest.raises(InputError, match="would count twice; leave one out"):
         twodof.fit(ARM, [bag, bag], FREE, gravity=GRAVITY)
-    with pytest.raises(InputError, match=r"`gravity` 0\.0, nan, 0\.0 is not finite"):
+    with pytest.raises(InputError, match=r"`gravity` 0\.0, nan, 0\.0 is not three finite numbers"):
         twodof.fit(ARM, bag, FREE, gravity=(0.0, float("nan"), 0.0))
 
 

@@ -73,8 +73,8 @@ def read_model(
     gravity: Sequence[float] | None = None,
 ) -> Model:
     """Read a robot whose parameters matching ``free`` are free; the other arguments are those of ``fit``."""
-    if gravity is not None and not np.isfinite(gravity).all():
-        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not finite")
+    if gravity is not None and not (np.shape(gravity) == (3,) and np.isfinite(gravity).all()):
+        raise InputError(f"`gravity` {', '.join(map(str, gravity))} is not three finite numbers")
     path, patterns = Path(urdf), [free] if isinstance(free, str) else free
     text = read_text(path, None)
     try:
