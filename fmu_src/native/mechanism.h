@@ -98,7 +98,7 @@ typedef struct {
     double coriolis[3], inertial[6], by_q[6], by_v[6];
 } JointForce;
 
-/* Of all bodies that a joint moves: mass, first moment, inertia, momentum, Coriolis matrix and wrench. */
+/* Sums over all bodies that a joint moves: mass, first moment, inertia, momentum, Coriolis matrix and wrench. */
 typedef struct {
     double mass, moment[3], inertia[6], p[3], B[3][3], f[6];
 } Load;

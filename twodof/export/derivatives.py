@@ -51,7 +51,7 @@ def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: A
 
 
 Load = tuple[Body, Array, Array, Array]
-"""Of bodies: themselves in the root's axes, their momentum p, the angular block of B, and f."""
+"""A body or several rigidly joined ones: inertia in the root's axes, momentum p, angular block of B, and wrench f."""
 
 
 def joint_force(body: Body, motions: Sequence[Array], beyond: Load) -> tuple[Load, list[Array]]:

@@ -83,9 +83,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[Fr
 
 def _tree(robot: JointTree, axes: Sequence[int]) -> str:
     """Return the joints' parents, of each the independent joint that it follows, the bodies, and the task's axes."""
-    count = np.cumsum([i != robot.path[-1] and _varies(body) for i, body in enumerate(robot.body)])
-    loaded = [0 if i == robot.path[-1] else int(count[i]) if _varies(body) else -1 for i, body in enumerate(robot.body)]
-    rows = {"PARENT": robot.parent, "LEADER": np.abs(robot.G).argmax(axis=1), "LOADED": loaded}
+    rows = {"PARENT": robot.parent, "LEADER": np.abs(robot.G).argmax(axis=1), "LOADED": _indices(robot)}
     lines = [f"static const int {name}[N_BODIES] = {{{', '.join(map(str, row))}}};" for name, row in rows.items()]
     parts = [[", ".join(map(_constant, part.flat)) for part in _parts(body)] for body in robot.body]
     constants = ", ".join(f"{{{mass}, {{{moment}}}, {{{inertia}}}}}" for mass, moment, inertia in parts)
@@ -203,24 +201,28 @@ def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
     They are all values of the end body, which carries the payload, and those of other bodies that depend on free links.
     """
     end_body, offset = robot.path[-1], _variables("offset", 3)
-    bodies, load, count = list(robot.body), dict[str, Value](), 1
+    bodies, load, indices = list(robot.body), dict[str, Value](), _indices(robot)
     loaded = bodies[end_body].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
     for i, body in enumerate(bodies):
-        name = "end_body->" if i == end_body else f"end_body[{count}]."
+        name = "end_body->" if i == end_body else f"end_body[{indices[i]}]."
         body = loaded if i == end_body else body
         values: dict[str, Value] = {f"{name}mass": body.mass}
         values |= _elements(f"{name}moment", body.moment) | _elements(f"{name}inertia", body.inertia[LOWER])
-        if i != end_body and not _varies(body):
+        if indices[i] < 0:
             continue
         ten = [Expression(k) if i == end_body or isinstance(v, Expression) else v for k, v in values.items()]
         bodies[i] = _body_of(np.array(ten[0]), np.array(ten[1:4], dtype=object), np.array(ten[4:], dtype=object))
         load |= values
-        count += i != end_body
     return bodies, load
 
 
-def _varies(body: Body) -> bool:
-    return any(isinstance(value, Expression) for part in _parts(body) for value in part.flat)
+def _indices(robot: JointTree) -> list[int]:
+    """Return the index of each body in the array ``end_body``: 0 for the end body, -1 for a constant one."""
+    free = [any(isinstance(value, Expression) for part in _parts(body) for value in part.flat) for body in robot.body]
+    free[robot.path[-1]] = False
+    indices = [sum(free[: i + 1]) if varies else -1 for i, varies in enumerate(free)]
+    indices[robot.path[-1]] = 0
+    return indices
 
 
 def _parts(body: Body, *others: Array) -> list[Array]:
