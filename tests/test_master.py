@@ -136,6 +136,13 @@ def test_realtime_paces_to_the_wall_clock(native_path):
     assert time.monotonic() - begin >= 0.5
 
 
+@pytest.mark.parametrize("speed", [0.1, 10.0])
+def test_a_run_takes_its_time_divided_by_the_speed(native_path, clock, speed):
+    pace = RealTime(speed)
+    assert twodof.simulate(native_path, pace=pace, stop_time=0.5, step=0.05).wall_time == pytest.approx(0.5 / speed)
+    assert pace.missed == 0
+
+
 def test_missed_deadlines_are_counted_and_caught_up_with(native_path, clock):
     pace = RealTime()
 
