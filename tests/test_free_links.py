@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -271,6 +272,40 @@ def test_names_starts_units_and_dependents(fmu: Path) -> None:
     linear = twodof.linearise(described, {"q": (0.3, 0.4), "v": (0.1, 0.2)}, inputs=["mass_link2", "inertia_link2"])
     assert linear.inputs == ("mass_link2", *(f"inertia_link2[{i}]" for i in range(1, 7)))
     assert np.all(linear.B[2:, 0] != 0.0) and np.all(linear.B[:2] == 0.0)
+
+
+def test_a_start_value_of_the_build_is_that_of_a_run(tmp_path: Path) -> None:
+    """The controller's model keeps the URDF's values, so that the verdict names a change."""
+    settings = {"mass_link2": 0.5, "com_link2": (0.1, 0.0, 0.0), "inertia_link2[6]": 1e-3}
+    free = {"control": "task", "free": ("mass:link2", "com:*", "inertia:link2")}
+    usual, own = (
+        twodof.build_fmu(tmp_path / f"{name}.fmu", options("twodof", settings=values, **free))
+        for name, values in (("Usual", {}), ("Own", settings))
+    )
+    starts = load_fmu(own).start_values
+    assert [starts[f"com_link2[{i}]"] for i in (1, 2, 3)] == [0.1, 0.0, 0.0] and starts["mass_link2"] == 0.5
+    assert starts["inertia_link2[6]"] == 1e-3 and starts["com_link1[1]"] == load_fmu(usual).start_values["com_link1[1]"]
+    whole = [[s.q for s in twodof.samples(fmu, settings=x, stop_time=0.2)] for fmu, x in ((usual, settings), (own, {}))]
+    assert whole[0] == whole[1]
+    first, second = twodof.simulate(usual, settings=settings, stop_time=1.0), twodof.simulate(own, stop_time=1.0)
+    texts = [[cause.text for cause in run.verdict.causes] for run in (first, second)]
+    assert texts[0] == texts[1] and "mass_link2 = 0.5: its model has 0.187" in str(texts[1])
+    assert twodof.simulate(own, settings={"mass_link2": 0.4}, stop_time=1.0).verdict.causes
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"mass_link2": 0.0}, "mass_link2 = 0 must be > 0"),
+        ({"com_link2": (1.0, 2.0)}, "com_link2 has 3 elements, 2 were given"),
+        ({"mass_link1": 0.5}, "there is no variable 'mass_link1'; did you mean 'mass_link2'?"),
+        ({"com_link2[2]": 0.1}, "references have the URDF's links; leave out `reference` or com_link2[2]"),
+    ],
+)
+def test_an_impossible_start_value_of_a_link_is_refused(tmp_path: Path, settings: Any, message: str) -> None:
+    built = options("twodof", free=("mass:link2", "com:link2"), settings=settings, reference=True)
+    with pytest.raises(BuildError, match=re.escape(message)):
+        twodof.build_fmu(tmp_path / "Arm.fmu", built)
 
 
 @pytest.mark.parametrize("control, fmi", [("task", 2), ("joint", 3), ("pose", 3), ("effort", 2)])

@@ -6,7 +6,7 @@
 
    for any a, where s are the directions in which joints slip against their friction F. With a = q̈_cmd, the dynamics
    cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ
-   where it is known; the armature is in both. Links whose masses are inputs have their start values in M̂ and ĥ. */
+   where it is known; the armature is in both. Links whose masses are inputs have the URDF's values in M̂ and ĥ. */
 #include <stddef.h>
 #include <string.h>
 
@@ -42,7 +42,7 @@ static void body(const double value[N_VARIABLES], int as_known, EndBody end_body
 #ifdef N_LINK_VALUES
     double link[N_LINK_VALUES];
     for (int i = 0; i < N_LINK_VALUES; i++)
-        link[i] = as_known ? START[LINK_VALUES + i] : value[LINK_VALUES + i];
+        link[i] = as_known ? LINK_KNOWN[i] : value[LINK_VALUES + i];
     load_bodies(payload, &value[PAYLOAD_COM], link, end_body);
 #else
     load_end_body(payload, &value[PAYLOAD_COM], end_body);
@@ -60,8 +60,8 @@ static int knows_all(const double value[N_VARIABLES])
 {
 #if COMMANDS_ACCELERATION
 #ifdef N_LINK_VALUES
-    for (int i = LINK_VALUES; i < LINK_VALUES + N_LINK_VALUES; i++)
-        if (value[i] != START[i])
+    for (int i = 0; i < N_LINK_VALUES; i++)
+        if (value[LINK_VALUES + i] != LINK_KNOWN[i])
             return 0;
 #endif
     return !is_held(value) && (value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0);

@@ -2,7 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -58,14 +58,14 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     options = replace(options, frame=end_effector(read_urdf(text), options.frame))
     if not options.meshes or options.part == "controller":
         text = without_meshes(text)
-    robot, table, starts = _model(options, text)
+    robot = _robot(options, text)
+    patterns = [name for name in options.free if ":" in name]
+    links, values = free_links(read_urdf(text), robot, patterns) if patterns else ([], [])
+    table, starts = _model(options, robot, values)
     if options.part == "controller":
         table = controller_table(table)
         if options.clocked and not next(v.start for v in table if v.group == "control_period"):
             raise BuildError("the clock needs the controller's period; set control_period, to 0.005 s for example")
-    patterns = [name for name in options.free if ":" in name]
-    links, values = free_links(read_urdf(text), robot, patterns) if patterns else ([], [])
-    table = free_table(table, options.free, values) if options.free else table
     urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
     flavour = _flavour(options, robot, table, links, urdf, starts)
     resources = {"robot.urdf": urdf.encode(), **meshes}
@@ -123,8 +123,8 @@ def _flavour(
     return native_flavour(options, robot, table, fmi, platforms, links)
 
 
-def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
-    """Return the robot, its variables, and the start values that differ from the table's."""
+def _robot(options: FmuOptions, urdf: str) -> Robot:
+    """Return the robot of a URDF, and log its warnings."""
     shipped = options.urdf is None
     axes = ("xy" if shipped else "xyz") if options.axes is None else options.axes
     assert options.frame is not None
@@ -137,6 +137,14 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
             sum(robot.moves_frame()),
             robot.frame,
         )
+    if shipped and axes != "xy":
+        raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
+    return robot
+
+
+def _model(options: FmuOptions, robot: Robot, links: Sequence[Variable]) -> tuple[list[Variable], dict[str, Any]]:
+    """Return the variables of a robot and of links, and the start values that differ from the table's."""
+    shipped = options.urdf is None
     rest = tuple(
         0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in zip(robot.q_min, robot.q_max, strict=True)
     )
@@ -145,11 +153,9 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         q = dict(zip(("joint1", "joint2"), DEFAULT_ARM["q_start"]))
         starts = {"gravity": DEFAULT_ARM["gravity"], "q_start": tuple(map(q.__getitem__, robot.joints))}
     settings = _settings(options, dict(zip(robot.joints, starts["q_start"])))
-    if shipped and axes != "xy":
-        raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
     try:
         placeholders = variable_table(robot, {**PLACEHOLDERS, **starts}, options.control)
-        values = resolve(_Variables({v.name: v for v in placeholders}, options.control), settings)
+        values = resolve(_Variables({v.name: v for v in (*placeholders, *links)}, options.control), settings)
         _set(robot, starts, options.control, values, POSE)
         at_rest = {**PLACEHOLDERS, **{group: starts[group] for group in POSE if group in starts}}
         plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
@@ -163,12 +169,15 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
                 starts["quat_des"] = tuple(plant.quat)
         _set(robot, starts, options.control, values, {name.partition("[")[0] for name in values})
         table = variable_table(robot, starts, options.control, options.outputs)
-        if refusal := next(filter(None, (v.refusal(v.start) for v in table if v.start is not None)), ""):
+        links = [replace(variable, start=values.get(variable.name, variable.start)) for variable in links]
+        if refusal := next(filter(None, (v.refusal(v.start) for v in (*table, *links) if v.start is not None)), ""):
             raise ParameterError(refusal)
+        if options.reference and (changed := next((v.name for v in links if v.start != v.known), "")):
+            raise ParameterError(f"references have the URDF's links; leave out `reference` or {changed}")
         Plant(robot, table, options.control).initialise()
     except (InputError, ParameterError) as error:
         raise BuildError(str(error)) from error
-    return robot, table, starts
+    return free_table(table, options.free, links) if options.free else table, starts
 
 
 class _Variables(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ import numpy as np
 from ..errors import BuildError, choice
 from ..plant.robot import Robot, moving_links
 from ..plant.urdf import INERTIA, Urdf
-from ..plant.variables import OF_LINKS, Variable
+from ..plant.variables import OF_LINKS, Variable, name_of_link
 from .bodies import FreeLink, Inertial
 from .straight_line import Expression
 
@@ -53,13 +52,14 @@ def free_links(urdf: Urdf, robot: Robot, patterns: Sequence[str]) -> tuple[list[
 def _inputs(group: str, link: str, given: Inertial) -> list[Variable]:
     """Return the values of a group of a link as inputs."""
     text, unit, elements = ELEMENTS[group]
-    called = f"{group}_{re.sub('[^0-9A-Za-z_]', '_', link)}"
+    called = name_of_link(group, link)
     if group == "mass":
-        return [Variable(group, None, "input", unit, float(given.mass), f"{text} of link {link}", called)]
-    starts = given.com if group == "com" else given.inertia[ROWS, COLUMNS]
+        mass = float(given.mass)
+        return [Variable(group, None, "input", unit, mass, f"{text} of link {link}", called, known=mass)]
+    values = (given.com if group == "com" else given.inertia[ROWS, COLUMNS]).tolist()
     return [
-        Variable(group, i, "input", unit, float(start), f"{text} of link {link}, {element}", called)
-        for i, (start, element) in enumerate(zip(starts, elements))
+        Variable(group, i, "input", unit, value, f"{text} of link {link}, {element}", called, known=value)
+        for i, (value, element) in enumerate(zip(values, elements))
     ]
 
 

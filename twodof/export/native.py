@@ -36,7 +36,7 @@ def model_header(
     table = engine_variables(robot, table, control, fmi)
     groups = [variable.group for variable in table]
     n_free = sum(variable.is_free for variable in table)
-    n_links = sum(group in OF_LINKS for group in groups)
+    known = [v.known for v in table if v.group in OF_LINKS]
     is_controller = table[groups.index("q")].causality == "input"
     sections = [
         "/* Constants of a robot, generated from its URDF. SI units. */\n"
@@ -52,11 +52,12 @@ def model_header(
         f"#define IS_CLOCKED {int(clocked)} /* an importer with event mode ticks the samples */\n"
         + "".join(f"#define HAS_{group.upper()}\n" for group in ("rcond", *ON_REQUEST) if group in groups),
         f"enum {{ N_FREE = {n_free} }}; /* parameters that are inputs */\n"
-        + (f"#define N_LINK_VALUES {n_links} /* values of links among them */\n" if n_links else ""),
+        + (f"#define N_LINK_VALUES {len(known)} /* values of links among them */\n" if known else ""),
         _groups(groups, {**FIRST, "FIRST_OUTPUT": "x"} if is_controller else FIRST),
         _references(table, fmi == 3 and arrays),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
+        "/* Values of links in the control law's model. */\n" + _table("double LINK_KNOWN", known) if known else "",
         _ranges(groups),
         _table("char *const JOINT_NAME", robot.joints),
         "/* Effort limits of the joints, HUGE_VAL where there is none. */\n" + _table("double EFFORT", robot.effort),

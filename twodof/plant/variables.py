@@ -7,6 +7,7 @@ table.
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,6 +60,7 @@ class Variable:
         called: name of the vector in the FMU, where it is not the group's; "" else.
         shown: whether the FMU has it; a part of the plant's engine otherwise.
         columns: number of columns of a matrix, whose elements ``index`` counts row by row; 0 for other variables.
+        known: of a value of a link, the URDF's, which the controller's model has; None for other variables.
     """
 
     group: str
@@ -70,6 +72,7 @@ class Variable:
     called: str = ""
     shown: bool = True
     columns: int = 0
+    known: float | None = None
 
     @property
     def name(self) -> str:
@@ -276,6 +279,11 @@ def free_table(table: Sequence[Variable], free: Collection[str], links: Sequence
     first = next(i for i, variable in enumerate(rest) if variable.causality == "output")
     inputs = [replace(variable, causality="input") for variable in table if variable.group in free]
     return [*rest[:first], *inputs, *links, *rest[first:]]
+
+
+def name_of_link(group: str, link: str) -> str:
+    """Return the name in the FMU of a group of values of a link."""
+    return f"{group}_{re.sub('[^0-9A-Za-z_]', '_', link)}"
 
 
 def controller_table(table: Sequence[Variable]) -> list[Variable]:

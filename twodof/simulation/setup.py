@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import inf
 from types import MappingProxyType
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fmu import Fmu
-from ..plant.urdf import UNBOUNDED, RobotError, Urdf, read_urdf
-from ..plant.variables import OF_LINKS
+from ..plant.urdf import INERTIA, UNBOUNDED, RobotError, Urdf, read_urdf
+from ..plant.variables import EXACT, OF_LINKS, name_of_link
 
 if TYPE_CHECKING:
     from ..geometry.kinematics import Kinematics
@@ -144,6 +145,24 @@ def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, flo
     """Return the setup of a run of an FMU with a robot."""
     found = setup(joints=fmu.joints, robot=robot, frame=fmu.frame, axes="".join(fmu.axes), step=step, starts=starts)
     units = tuple(own or fmu.variables[name].unit or "" for own, name in zip(found.units, fmu.vector("q")))
+    return found._replace(units=units, links=_inertials(fmu, robot))
+
+
+def _inertials(fmu: Fmu, robot: Urdf | None) -> dict[str, float]:
+    """Return the URDF's values for links that are inputs; start values that differ by rounding alone are the URDF's."""
     inputs = (name for name, v in fmu.variables.items() if fmu.control and v.causality == "input")
-    links = {name: float(fmu.start_values[name]) for name in inputs if name.partition("_")[0] in OF_LINKS}
-    return found._replace(units=units, links=links)
+    found = {name: float(fmu.start_values[name]) for name in inputs if name.partition("_")[0] in OF_LINKS}
+    if not found or robot is None:
+        return found
+    from ..geometry.kinematics import Kinematics  # as above
+
+    kinematics, names = Kinematics(robot, fmu.joints), Counter(name_of_link("", link) for link in robot.links)
+    for link in (link for link in robot.links if names[name_of_link("", link)] == 1):
+        mass, com, inertia = kinematics.body(link)
+        tensor = [inertia[3 * row + column] for row, column in INERTIA.values()]
+        for group, values in {"mass": [mass], "com": com, "inertia": tensor}.items():
+            rounding = EXACT * max(map(abs, values))
+            for name, value in zip(fmu.vector(name_of_link(group, link)), values):
+                if name in found and abs(found[name] - value) > rounding:
+                    found[name] = value
+    return found
