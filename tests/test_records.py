@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import numpy as np
@@ -36,12 +37,13 @@ from bags import (
 )
 
 import twodof
-from twodof.bag import joint_states, reader, sqlite
+from twodof.bag import joint_states, reader, recording, sqlite
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.records import DamageError, ReadBudget
 from twodof.cli.main import main
 from twodof.errors import BagError
+from twodof.simulation.setup import setup as setup_of
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TOPIC = HEADER + SCHEMA + CHANNEL
@@ -453,6 +455,35 @@ def test_long_names_in_a_provenance_are_refused(native_path, tmp_path, change, c
         json.dumps({**facts, **change, "fmu": {**facts["fmu"], "file": change.get("fmu", "")}})
     )
     assert "run.json': it has a name of more than 1000 characters" in refused(capsys, bag)
+
+
+def test_a_provenance_with_more_start_values_than_a_system_has_is_refused(native_path, tmp_path, capsys):
+    bag = tmp_path / "bag"
+    twodof.simulate(native_path, twodof.Bag(bag), stop_time=0.1)
+    facts = json.loads((bag / "run.json").read_text())
+    facts["start_values"] |= {f"a{i}": 0.0 for i in range(200_000)}
+    (bag / "run.json").write_text(json.dumps(facts))
+    assert "run.json': it has more than 200000 start values" in refused(capsys, bag)
+
+
+def test_a_verdict_does_not_copy_the_start_values_for_each_question(native_path, tmp_path, monkeypatch):
+    """A bag may have a hundred thousand, and a verdict has hundreds of questions."""
+    bag, copies = tmp_path / "bag", count()
+
+    class Starts(dict[str, Any]):
+        def __iter__(self):  # with it, a copy takes the keys
+            next(copies)
+            return super().__iter__()
+
+        def keys(self):
+            next(copies)
+            return super().keys()
+
+    monkeypatch.setattr(recording, "setup_of", lambda **facts: setup_of(**{**facts, "starts": Starts(facts["starts"])}))
+    twodof.simulate(native_path, twodof.Bag(bag), settings={"payload": 3.0, "Kp": 5.0}, stop_time=0.5)
+    run = read_bag(bag)
+    del run.provenance["verdict"]
+    assert "payload of 3 kg" in run.verdict.lines[0] and next(copies) < 20
 
 
 @pytest.mark.parametrize("command", ["info", "plot"])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
-from ..bounds import CHANGE, MAX_HELD, MAX_NAME, MAX_PROVENANCE, MAX_ROBOTS
+from ..bounds import CHANGE, MAX_HELD, MAX_NAME, MAX_PROVENANCE, MAX_ROBOTS, MAX_VARIABLES
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..fmu import System
@@ -245,6 +245,8 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
             if not fits(content, SHAPE) or not fits(content.get(KNOWN_UNTIL, 0.0), NUMBER):
                 raise ValueError("it is damaged")
+            if len(content["start_values"]) > MAX_VARIABLES:
+                raise ValueError(f"it has more than {MAX_VARIABLES} start values")
             facts = {**content, **content["fmu"]}
             if max(map(len, (*content["joints"], *(facts[key] for key in NAMES)))) > MAX_NAME:
                 raise ValueError(f"it has a name of more than {MAX_NAME} characters")

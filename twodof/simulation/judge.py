@@ -9,6 +9,7 @@ Nothing is interpolated: times and extremes are those of samples.
 from __future__ import annotations
 
 import io
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from copy import copy
 from math import inf, nan, sqrt
@@ -280,8 +281,8 @@ class Judge:
 
     @property
     def held(self) -> Mapping[str, float]:
-        """Present values of inputs and parameters."""
-        return {**self.setup.starts, **self.inputs}
+        """Present values of inputs and parameters; a view, because a bag may have a million start values."""
+        return ChainMap(self.inputs, self.setup.starts)  # type: ignore[arg-type]  # it is only read
 
     def given(self, group: str) -> Array:
         """Return the present elements of a vector of inputs or parameters."""
