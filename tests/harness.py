@@ -219,8 +219,11 @@ def unzipped(fmu):
 
 @contextlib.contextmanager
 def wine(folder):
-    """Yield the command and the environment that run Windows programs; its server ends too."""
-    command, server = needs("wine"), needs("wineserver")
+    """Yield the command and the environment that run Windows programs; its server ends too.
+
+    The services of Wine start here, once: a program that starts them has their page faults in its own output.
+    """
+    command, server, quiet = needs("wine"), needs("wineserver"), subprocess.DEVNULL
     environment = {
         **os.environ,
         "TMPDIR": str(folder),
@@ -229,6 +232,9 @@ def wine(folder):
         "WINEDLLOVERRIDES": "mscoree,mshtml=",
     }
     try:
+        (folder / "wine").mkdir()
+        subprocess.run([server, "--persistent"], env=environment, check=True)
+        subprocess.run([command, "wineboot"], env=environment, check=True, stdout=quiet, stderr=quiet)
         yield command, environment
     finally:
         for option in ("--kill", "--wait"):
