@@ -69,7 +69,7 @@ def without(judge: Judge, cause: Cause) -> Repetition | None:
         case "damping":
             return plan("with critical damping", _critical(judge))
         case "degrees":
-            return plan("read as degrees", _in_radians(judge, cause.joint))
+            return plan("read as degrees", _in_radians(judge))
         case "reach" if not judge.wanted("quat").size and judge.changed <= 0.0:
             return plan("with a target in reach", _in_reach(judge, cause))
         case "time" if not judge.moving and cause.share <= LONGER * judge.duration:
@@ -99,10 +99,10 @@ def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
     return "without it", _elements(held, subject, 0.0)
 
 
-def _in_radians(judge: Judge, joint: str) -> dict[str, float]:
-    """Return large positions of a joint, read as degrees, in rad."""
-    i = judge.setup.joints.index(joint)
-    values = {f"{group}[{i + 1}]": judge.held.get(f"{group}[{i + 1}]", 0.0) for group in ("q_des", "q_start")}
+def _in_radians(judge: Judge) -> dict[str, float]:
+    """Return large positions of all joints, read as degrees, in rad."""
+    turning = [i + 1 for i, unit in enumerate(judge.setup.units) if unit == "rad"]
+    values = {name: judge.held.get(name, 0.0) for i in turning for name in (f"q_des[{i}]", f"q_start[{i}]")}
     return {name: radians(value) for name, value in values.items() if abs(value) > TURN}
 
 
