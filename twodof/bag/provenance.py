@@ -52,7 +52,8 @@ NAMES = ("name", "file", "robot", "frame", "root")
 class Provenance(TypedDict, total=False):
     """Content of run.json; empty for a third-party bag.
 
-    ``signals`` has the names of the recorded signals, and ``system`` the FMUs of a system and their connections.
+    ``texts`` has start values of variables of type String, ``signals`` the names of the recorded signals, and
+    ``system`` the FMUs of a system and their connections.
     ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` has pairs of a time and facts of a
     third party. ``verdict`` is missing if the writer died.
     """
@@ -67,6 +68,7 @@ class Provenance(TypedDict, total=False):
     start_time: float
     step: float
     start_values: dict[str, Value]
+    texts: dict[str, str]
     versions: dict[str, str]
     command_line: str
     urdf: str | None
@@ -159,6 +161,7 @@ def provenance_of(run: Experiment, command_line: str) -> Provenance:
         "versions": versions(*PACKAGES),
         "command_line": command_line,
         "urdf": fmu.urdf,
+        **({"texts": dict(run.texts)} if run.texts else {}),
         **({"signals": [*run.signals]} if run.signals else {}),
         **(_system(fmu) if isinstance(fmu, System) else {}),
     }

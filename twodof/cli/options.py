@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..plant.numerals import number
+from ..plant.numerals import number, whole_number
 from . import completion
 from .help import Parser
 
@@ -150,8 +150,8 @@ def _given(options: argparse.Namespace, option: str) -> bool:
     return any(v is not None and v is not False and v != [] for v in given_options(options, *names).values())
 
 
-def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
-    """Parse NAME=VALUE texts: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
+def parse_settings(texts: Iterable[str], option: str = "--set", words: Collection[str] = ()) -> dict[str, Setting]:
+    """Parse NAME=VALUE texts: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``; values of ``words`` stay text."""
     settings: dict[str, Setting] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -160,7 +160,8 @@ def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Set
             raise CommandLineError(f"{option} {text}: expected NAME=VALUE")
         if name in settings:
             raise CommandLineError(f"{option} {name} is given twice")
-        settings[name] = _parse_value(f"{option} {name}", value.strip())
+        value = value.strip()
+        settings[name] = value if name in words else _parse_value(f"{option} {name}", value)
     return settings
 
 
@@ -168,12 +169,18 @@ def _parse_value(name: str, text: str) -> Setting:
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     try:
-        numbers = [number(part) for part in text.split(",")]
+        numbers = [_parse_number(part) for part in text.split(",")]
     except ValueError:
         raise CommandLineError(
             f"{name}={text}: '{text}' is not a number; write numbers as 0.2,0.1 without units, or true or false"
         ) from None
     return numbers[0] if len(numbers) == 1 else numbers
+
+
+def _parse_number(text: str) -> float:
+    """Return a number; whole numbers that a float cannot represent are exact."""
+    parsed = number(text)
+    return whole_number(text) if 2.0**53 <= abs(parsed) < 2.0**64 and text.strip(" +-").isdigit() else parsed
 
 
 def parse_locks(texts: Iterable[str]) -> dict[str, float]:

@@ -20,6 +20,7 @@ FAILED_IF = 3
 
 if TYPE_CHECKING:
     from ..bag.writer import Bag
+    from ..fmu import Fmu, Setting
     from ..simulation.experiments import Experiment
     from ..simulation.pace import RealTime
     from ..simulation.run_summary import Summary
@@ -74,8 +75,8 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
     from ..fmu import load_fmu
     from ..simulation.experiments import experiment
 
-    settings = parse_settings(options.settings)
     fmu, table, changes = load_fmu(chosen_fmu(options), getattr(options, "robot", "")), options.input, None
+    settings = _settings(options, fmu)
     if table is not None:
         folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
         if Path(folder).is_dir() and folder:
@@ -96,6 +97,14 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
         stamp_start=options.stamp_start,
         signals=getattr(options, "signals", False),
     )
+
+
+def _settings(options: argparse.Namespace, fmu: Fmu) -> dict[str, Setting]:
+    """Return the settings of the options; values of texts and enumerations are text."""
+    words = {name for name, variable in fmu.variables.items() if variable.type in ("String", "Enumeration")}
+    words |= {name.partition("[")[0] for name in words}
+    words |= {name for name, own in fmu.aliases.items() if own in words}
+    return parse_settings(options.settings, words=words)
 
 
 def bag_of(options: argparse.Namespace, path: str | Path, *, measured: bool = False) -> Bag:
@@ -131,7 +140,7 @@ def print_summary(
     """Print the summary of a run."""
     last = summary.last
     rows = [("FMU", f"{run.fmu.path}")]
-    for name, value in parse_settings(options.settings).items():
+    for name, value in _settings(options, run.fmu).items():
         elements = run.fmu.vector(name)
         if len(elements) > 1 and isinstance(value, int | float):
             rows.append((f"{name}", f"{value:g}, all {len(elements)} elements"))

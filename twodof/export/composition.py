@@ -26,6 +26,7 @@ from .model_description import model_description
 from .native import engine_variables
 from .references import references
 from .start_values import resolve
+from .typed_values import Type
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)
@@ -186,6 +187,10 @@ class _Variables(NamedTuple):
     variables: Mapping[str, Variable]
     control: str
     aliases: Mapping[str, str] = MappingProxyType({})
+
+    def type_of(self, name: str) -> Type:
+        """Return the type of a variable, without its range, which ``Variable.refusal`` has in words."""
+        return Type(self.variables[name].type)
 
 
 def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:

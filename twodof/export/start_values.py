@@ -3,15 +3,14 @@
 import re
 from collections.abc import Mapping
 from itertools import chain, count, takewhile
-from math import inf, isfinite
 from typing import Any, Protocol
 
 from ..errors import InputError, choice, nearest
 from ..plant.variables import CONTROLS, Value
+from .typed_values import Type
 
 Setting = object
-"""A number, a Boolean, or a sequence or array of these; a dict of mixed values has the type ``dict[str, object]``."""
-LIMIT_OF_INTEGERS = 2**31
+"""A number, Boolean or text, or a sequence or array of these; dicts of mixed values have the type dict[str, object]."""
 
 
 class Variables(Protocol):
@@ -28,6 +27,9 @@ class Variables(Protocol):
     @property
     def aliases(self) -> Mapping[str, str]:
         """Further names, and the names that they stand for."""
+
+    def type_of(self, name: str) -> Type:
+        """Return the type of a variable."""
 
 
 def vector(variables: Mapping[str, Any], group: str) -> list[str]:
@@ -53,9 +55,18 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
     Raises:
         InputError: a name is unknown or an output, or a value has a wrong number or type, or is not finite.
     """
+    values, texts = resolve_all(fmu, settings)
+    if texts:
+        raise InputError(f"{next(iter(texts))} is of type String, which can only be set before a run")
+    return values
+
+
+def resolve_all(fmu: Variables, settings: Mapping[str, Setting]) -> tuple[dict[str, Value], dict[str, str]]:
+    """Return values as ``resolve`` does, and those of variables of type String; errors are the same."""
     if not isinstance(settings, Mapping):
         raise InputError(f"settings are values by name, as {{'Kp': 80}}, not {settings!r:.50}")
     values: dict[str, Value] = {}
+    texts: dict[str, str] = {}
     for name, setting in settings.items():
         name = fmu.aliases.get(name, name)
         elements = [name] if name in fmu.variables else vector(fmu.variables, name)
@@ -69,40 +80,21 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
         if len(given) != len(elements):
             raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
         for element, value in zip(elements, given, strict=True):
-            values[element] = _checked(fmu, element, value)
-    return values
+            checked = _checked(fmu, element, value)
+            if isinstance(checked, str):
+                texts[element] = checked
+            else:
+                values[element] = checked
+    return values, texts
 
 
-def _checked(fmu: Variables, name: str, value: object) -> Value:
+def _checked(fmu: Variables, name: str, value: object) -> Value | str:
     variable = fmu.variables[name]
     if variable.causality not in ("input", "parameter"):
         start = name.replace(group := name.partition("[")[0], f"{group}_start", 1)
         remedy = f"; set {start}" if start in fmu.variables else ""
         raise InputError(f"{name} is of causality '{variable.causality}' and cannot be set{remedy}")
-    if variable.type == "Boolean":
-        if not isinstance(value, bool):
-            raise InputError(f"{name} = {value!r}: expected true or false")
-        return value
-    if variable.type not in ("Real", "Integer"):
-        raise InputError(f"{name} is of type {variable.type} and cannot be set; Float64, Int32 and Boolean can")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{name} = {value!r}: expected a number")
-    try:
-        number = float(value)
-    except OverflowError:  # an integer too large for a float
-        number = inf if value > 0 else -inf
-    if not isfinite(number):
-        raise InputError(f"{name} = {number} is not finite")
-    if variable.type == "Integer":
-        if not is_whole(number):
-            raise InputError(f"{name} = {value:.17g} must be a whole number of 32 bits")
-        return int(number)
-    return number
-
-
-def is_whole(number: float) -> bool:
-    """Return whether a number is a whole number of 32 bits."""
-    return float(number).is_integer() and abs(number) < LIMIT_OF_INTEGERS
+    return fmu.type_of(name).value(value, name)
 
 
 def _of_another(fmu: Variables, name: str) -> str:

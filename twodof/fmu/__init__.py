@@ -5,7 +5,7 @@ from contextlib import redirect_stdout
 with redirect_stdout(None):  # FMPy prints on aarch64-linux that it has no logger for FMI 2.0
     import fmpy  # noqa: F401
 
-from ..export.start_values import Setting, no_variable, resolve
+from ..export.start_values import Setting, no_variable, resolve, resolve_all
 from .description import Fmu, load_any_fmu, opened, resource_reader
 from .instance import Instance, Values
 from .system import System, load_fmu
@@ -24,5 +24,6 @@ __all__ = [
     "no_variable",
     "opened",
     "resolve",
+    "resolve_all",
     "resource_reader",
 ]

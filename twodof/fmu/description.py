@@ -20,6 +20,7 @@ from ..errors import ZIP_ERRORS, FmuError, path_of
 from ..export.compiler import host_platform
 from ..export.icon import side_view
 from ..export.start_values import groups_of, vector
+from ..export.typed_values import Type
 from ..files import read_member, shown
 from ..notebook import card, picture
 from .archives import checksums, open_archive, read_archive
@@ -129,6 +130,10 @@ class Fmu:
         """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
         return vector(self.variables, self.aliases.get(group, group))
 
+    def type_of(self, name: str) -> Type:
+        """Return the type of a variable."""
+        return self.variables[name].value_type
+
     def groups(self, causality: str) -> dict[str, list[str]]:
         """Return vectors and scalars of one causality by group name."""
         return groups_of(self.variables, causality)
@@ -183,7 +188,7 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     )
     for name, variable in fmu.variables.items():
         try:
-            _ = variable.start_value
+            _ = variable.initial_value, variable.value_type
         except ValueError:
             raise FmuError(f"'{where}': start value of {name}, '{variable.start:.50}', is not a number") from None
     return fmu

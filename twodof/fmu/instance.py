@@ -22,6 +22,7 @@ from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
 from ..errors import FmuError, SimulationError
+from ..export.typed_values import IN_FMI_3
 from .description import Fmu
 
 logger = logging.getLogger("twodof.fmu")
@@ -86,11 +87,11 @@ class Instance:
         self._fatal = self._running = False
         self._ends = c_bool()  # doStep's argument terminateSimulation in FMI 3.0
         self._t, self._h = c_double(), c_double()
-        starts: dict[tuple[str, int], list[float | bool]] = {}
+        starts: dict[tuple[str, int], list[Any]] = {}
         for v in fmu.variables.values():
             vector = starts.setdefault((v.type, v.reference), [])
             if v.element == len(vector):  # an alias has the reference of another vector
-                vector.append(v.start_value or (0.0 if v.type == "Real" else 0))
+                vector.append(v.initial_value)
         self._starts, self._vectors = starts, deepcopy(starts)  # start and latest values by type and value reference
         identifier = fmu.description.coSimulation.modelIdentifier
         self._name = _unique(name or identifier)
@@ -119,6 +120,7 @@ class Instance:
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
         self._setters = {"Real": slave.setReal, "Integer": slave.setInteger, "Boolean": slave.setBoolean}
+        self._setters |= {"Enumeration": slave.setInteger, "String": slave.setString}
         self._getters = {"Integer": slave.getInteger, "Boolean": slave.getBoolean}
         self._do_step, self._get = slave.dll["fmi2DoStep"], slave.dll["fmi2GetReal"]
         self._put = slave.dll["fmi2SetReal"]
@@ -126,12 +128,12 @@ class Instance:
         self._rest: tuple[object, ...] = (self.final,)
         return slave
 
-    def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
+    def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool | str]) -> None:
         """Set start values, and enter and exit initialisation mode; the stop time may be infinite."""
         self.begin(start_time, stop_time, values)
         self.start()
 
-    def begin(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
+    def begin(self, start_time: float, stop_time: float, values: Mapping[str, float | bool | str]) -> None:
         """Set start values and enter initialisation mode."""
         self.set(values)
         self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
@@ -151,9 +153,9 @@ class Instance:
         self._running = False
         self._vectors = deepcopy(self._starts)
 
-    def set(self, values: Mapping[str, float | bool]) -> None:
+    def set(self, values: Mapping[str, float | bool | str]) -> None:
         """Set variables by name; other elements of a vector keep their last values."""
-        changed: dict[tuple[str, int], list[float | bool]] = {}
+        changed: dict[tuple[str, int], list[Any]] = {}
         for name, value in values.items():
             variable = self.fmu.variables[name]
             key = variable.type, variable.reference
@@ -334,10 +336,9 @@ class Instance3(Instance):
             slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=lambda _environment, *message: self.log(*message), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
-        self._setters = {"Real": slave.setFloat64, "Integer": slave.setInt32, "Boolean": slave.setBoolean}
+        self._setters = {kind: getattr(slave, f"set{named}") for kind, named in IN_FMI_3.items()}
         self._getters = {"Integer": slave.getInt32, "Boolean": slave.getBoolean}
-        self._do_step, self._get = slave.dll["fmi3DoStep"], slave.dll["fmi3GetFloat64"]
-        self._put = slave.dll["fmi3SetFloat64"]
+        self._do_step, self._get, self._put = (slave.dll[f"fmi3{n}"] for n in ("DoStep", "GetFloat64", "SetFloat64"))
         self.final = c_bool(True)
         self._rest = (self.final, *results)
         return slave

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..bounds import MAX_CELLS, MAX_REFERENCES
 from ..errors import FmuError, SimulationError
-from ..export.start_values import is_whole
+from ..export.typed_values import WHOLE
 from ..files import read_member
 from .description import Fmu, opened
 from .scalar import Scalar
@@ -241,7 +241,7 @@ class _Files:
         kind = self._fmu.variables[name].type if name in self._fmu.variables else "Real"
         if kind not in KINDS:
             raise ValueError(f"{source}: '{name}' is of type {kind}, which is not set")
-        if kind == "Integer" and not all(map(is_whole, values)):
+        if kind == "Integer" and not all(float(value).is_integer() and int(value) in WHOLE[kind] for value in values):
             raise ValueError(f"{source}: '{name}' has a value that is no whole number of 32 bits")
 
     def table(self, source: str) -> Table:

@@ -6,11 +6,12 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
-from math import prod
+from math import inf, prod
 
 from fmpy.model_description import ModelVariable
 
 from ..errors import FmuError
+from ..export.typed_values import LARGEST, WHOLE, Type
 from .validation import NUMBERS
 
 
@@ -21,13 +22,16 @@ class Scalar:
     Attributes:
         name: name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])".
         causality, unit: as in the description.
-        type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description.
+        type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description, with
+            brackets for an array of Strings.
         start: text of the start value; None without one.
         description: description of the scalar, or of the whole array.
         reference: value reference.
         variability: as in the description, or its default there.
         relative: whether it is a difference of values, to which the offset of a unit does not apply.
         element: 0-based index in the array, row by row.
+        low, high: texts of the range; None without one.
+        items: names and numbers of the items of an enumeration.
     """
 
     name: str
@@ -40,6 +44,9 @@ class Scalar:
     variability: str
     relative: bool
     element: int = 0
+    low: str | None = None
+    high: str | None = None
+    items: tuple[tuple[str, int], ...] = ()
 
     @property
     def start_value(self) -> float | bool | None:
@@ -47,10 +54,27 @@ class Scalar:
         read = NUMBERS.get(self.type)
         return None if self.start is None or read is None else read(self.start)
 
+    @property
+    def initial_value(self) -> float | bool | str:
+        """Start value of any type; 0, false or an empty text without one."""
+        read = NUMBERS.get(self.type) or (int if self.type in WHOLE else float if self.type in LARGEST else str)
+        return read("0" if read is not str else "") if self.start is None else read(self.start)
+
+    @property
+    def value_type(self) -> Type:
+        """Type, with the range of whole numbers and of Float32; FMUs refuse other real numbers themselves."""
+        if self.type not in WHOLE and self.type != "Float32":
+            return Type(self.type)
+        read = int if self.type in WHOLE else float
+        low, high = (end if text is None else read(text) for text, end in ((self.low, -inf), (self.high, inf)))
+        return Type(self.type, low, high, dict(self.items))
+
 
 def scalars(variable: ModelVariable) -> Iterator[Scalar]:
     """Yield a scalar variable itself, or the elements of an array."""
     kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
+    kind += "[]" if kind == "String" and variable.dimensions else ""
+    items = [] if variable.declaredType is None else variable.declaredType.items
     whole = Scalar(
         name=variable.name,
         causality=variable.causality,
@@ -61,6 +85,9 @@ def scalars(variable: ModelVariable) -> Iterator[Scalar]:
         reference=variable.valueReference,
         variability=variable.variability,
         relative=bool(variable.relativeQuantity),
+        low=variable.min,
+        high=variable.max,
+        items=tuple((item.name, int(item.value)) for item in items),
     )
     if not variable.dimensions:
         yield whole

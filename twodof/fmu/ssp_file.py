@@ -86,6 +86,7 @@ class Parameter(NamedTuple):
     """
 
     name: str
+    type: str
     value: float | bool | str
     unit: Unit
     converts: bool = True
@@ -233,9 +234,9 @@ class _File:
         for xml in rows:
             kind = next(child for child in xml if child.tag.startswith(SSV))
             text, unit = kind.get("value", ""), kind.get("unit", "")
-            of_kind, own = NUMBERS.get(kind.tag.removeprefix(SSV)), xml.get("name", "")
-            value = text if of_kind is None else of_kind(text.strip())
-            given[prefix + own] = Parameter(prefix + own, value, units.get(unit, Unit(unit)))
+            of, own = kind.tag.removeprefix(SSV), xml.get("name", "")
+            value = NUMBERS[of](text.strip()) if of in NUMBERS else text
+            given[prefix + own] = Parameter(prefix + own, of, value, units.get(unit, Unit(unit)))
         mapping = binding.find(f"{SSD}ParameterMapping")
         if mapping is None:
             yield from given.values()

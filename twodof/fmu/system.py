@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from copy import copy
@@ -12,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from ..bounds import MAX_DESCRIPTIONS, MAX_FILES, MAX_VARIABLES
-from ..errors import FmuError, SspError, choice
+from ..errors import FmuError, InputError, SspError, choice
 from ..export.package import has_member
-from ..export.start_values import is_whole
+from ..export.typed_values import Type
 from .description import RECORDED, SI, Fmu, load_any_fmu, logged
 from .scalar import Scalar
 from .ssp_file import IDENTITY, STRUCTURE, Affine, Parameter, read_ssp
-from .validation import NUMBERS
 from .wiring import Link, Node, Wiring, conversion, order
+
+Start = float | bool | str
+"""A start value of any type."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -48,7 +49,7 @@ class System(Fmu):
     batches: tuple[tuple[Node, ...], ...] = ()
     initial: tuple[tuple[Node, ...], ...] = ()
     places: Mapping[str, Node] = field(default_factory=dict)
-    bound: Mapping[Node, float | bool] = field(default_factory=dict)
+    bound: Mapping[Node, Start] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<System '{self.path}': {', '.join(self.components)}; joints {', '.join(self.joints)}>"
@@ -131,7 +132,8 @@ def load_system(path: Path, robot: str = "") -> System:
     batches, initial = (tuple(map(tuple, order(path, fmus, links, start))) for start in (False, True))
     chosen = _robot(path, fmus, robot)
     starts = _bound(path, wiring)
-    variables, places = _variables(path, wiring, fmus, links, starts, chosen, _measuring(fmus, links, chosen))
+    numbers = {node: value for node, value in starts.items() if not isinstance(value, str)}
+    variables, places = _variables(path, wiring, fmus, links, numbers, chosen, _measuring(fmus, links, chosen))
     digest = hashlib.sha256(structure)
     for fmu in by_source.values():
         digest.update(f"{fmu.guid} {sorted(fmu.members.items())}\0".encode())
@@ -185,40 +187,45 @@ def _driving(links: list[Link], robot: str) -> set[str]:
     return driving
 
 
-def _bound(path: Path, wiring: Wiring) -> dict[Node, float | bool]:
+def _bound(path: Path, wiring: Wiring) -> dict[Node, Start]:
     """Return start values from parameter bindings; outer systems take precedence over inner ones.
 
     A connector with a value passes it to the connected variables; without one, they keep their own.
     """
-    starts: dict[Node, float | bool] = {}
+    starts: dict[Node, Start] = {}
     for element in wiring.elements.values():
         for parameter in element.parameters:
             node = wiring.find(f"{element.name}.{parameter.name}" if element.name else parameter.name)
             if node is not None:  # by the standard, other parameters are ignored
                 starts[node] = _value(path, wiring, node, parameter)
-    passed = wiring.passed(starts).items()
+    passed = wiring.passed({node: value for node, value in starts.items() if not isinstance(value, str)}).items()
     return starts | {node: _typed(path, node, wiring.scalar(node), value) for node, value in passed}
 
 
-def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> float | bool:
+def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> Start:
     """Return the value of a parameter for a variable or connector, in its unit and of its type."""
     value, scalar, total = parameter.value, wiring.scalar(node), parameter.map
     if isinstance(value, str):
-        raise FmuError(f"'{path}': the value of '{node}', '{value:.80}', is text or an enumeration: not supported")
+        if scalar is None or scalar.type != parameter.type or total != IDENTITY:
+            use = "transformed" if scalar is not None and scalar.type == parameter.type else "for another type"
+            raise FmuError(
+                f"'{path}': the value of '{node}', '{value:.80}', is a {parameter.type} {use}: not supported"
+            )
+        return _typed(path, node, scalar, value)
     if parameter.converts:
         given, own = wiring.applied(node, parameter.unit), wiring.unit(node)
         total = total.after(conversion(path, given, own, f"'{node}' and its value"))
     return _typed(path, node, scalar, value if isinstance(value, bool) else total.of(value))
 
 
-def _typed(path: Path, node: Node, scalar: Scalar | None, value: float | bool) -> float | bool:
+def _typed(path: Path, node: Node, scalar: Scalar | None, value: Start) -> Start:
     """Return a value for a variable, None for a connector, if it has the variable's type."""
-    kind, truth = "Real" if scalar is None else scalar.type, isinstance(value, bool)
-    if scalar is not None and (truth != (kind == "Boolean") or kind not in NUMBERS):
-        raise FmuError(f"'{path}': the value of '{node}', {value}, is not of type {kind}")
-    if not math.isfinite(value) or (kind == "Integer" and not is_whole(value)):
-        raise FmuError(f"'{path}': the value of '{node}', {value}, is not finite, or no whole number of 32 bits")
-    return int(value) if kind == "Integer" else value
+    if scalar is None and isinstance(value, bool):
+        return value
+    try:
+        return (Type("Real") if scalar is None else scalar.value_type).value(value, str(node))
+    except InputError as error:
+        raise FmuError(f"'{path}': {error}") from error
 
 
 def _variables(
@@ -258,11 +265,12 @@ def _variables(
         values = [starts.get(link.target, scalar.start_value) for link, scalar in zip(targets, scalars)]
         inverted = {value if value is None else link.map.inverse(value) for link, value in zip(targets, values)}
         start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
-        start = start if start is None else _typed(path, source, first, start)
+        typed = None if start is None else _typed(path, source, first, start)
+        assert not isinstance(typed, str)  # connections have numbers and Booleans
         same = [link.target for link in targets if link.map == IDENTITY or wiring.unit(link.target).is_scaled]
         plain = _is_plain(wiring, source, first, driving & {target.element for target in same})
         scalar = replace(first, unit=wiring.unit(source).name or first.unit)
-        add(str(source) if plain else f"system.{source}", source, scalar, causality, start)
+        add(str(source) if plain else f"system.{source}", source, scalar, causality, typed)
     ends = {link.target for link in links}
     names = Counter(name for fmu in fmus.values() for name in fmu.variables)
     for element in (robot, *(name for name in fmus if name != robot)):

@@ -49,7 +49,7 @@ class SystemInstance:
         self._steps = [(name, instance.step) for name, instance in instances.items()]
         self._due = True
 
-    def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
+    def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool | str]) -> None:
         """Set start values, and enter and exit initialisation mode, for all FMUs together."""
         own = self._by_component(values)
         for name, instance in self._instances.items():
@@ -68,21 +68,23 @@ class SystemInstance:
             with _named(name):
                 instance.reset()
 
-    def set(self, values: Mapping[str, float | bool]) -> None:
+    def set(self, values: Mapping[str, float | bool | str]) -> None:
         """Set variables and connectors of the system by name."""
         for name, own in self._by_component(values).items():
             with _named(name):
                 self._instances[name].set(own)
         self._due = True
 
-    def _by_component(self, values: Mapping[str, float | bool]) -> dict[str, dict[str, float | bool]]:
+    def _by_component(self, values: Mapping[str, float | bool | str]) -> dict[str, dict[str, float | bool | str]]:
         """Return values by component and its variable's name; a connector's value goes to the connected variables."""
-        own: dict[str, dict[str, float | bool]] = {}
+        own: dict[str, dict[str, float | bool | str]] = {}
         for name, value in values.items():
             node = self._system.places[name]
             ends = [(link.target, link.map) for link in self._outer.get(node, [])] or [(node, IDENTITY)]
             for target, affine in ends:
-                own.setdefault(target.element, {})[target.connector] = affine.of(value)
+                own.setdefault(target.element, {})[target.connector] = (
+                    value if isinstance(value, str) else affine.of(value)
+                )
         return own
 
     def step(self, t: float, h: float) -> None:

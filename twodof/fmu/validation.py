@@ -63,11 +63,14 @@ def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescrip
 
 
 def _complete(description: ModelDescription, root: ET.Element) -> None:
-    """Add the attributes of variables that FMPy leaves out: relativeQuantity, and those of declared types."""
+    """Add the attributes of variables that FMPy leaves out: relativeQuantity, ranges, and those of declared types."""
     variables = [(v.get("name"), each) for v in root.iterfind("ModelVariables/*") for each in (v, *v)]
+    whole = {name: each for name, each in variables if each.tag.startswith("UInt")}
     stated = {name: each.get(RELATIVE) in TRUE for name, each in variables if RELATIVE in each.attrib}
     for variable in description.modelVariables:
         variable.relativeQuantity = stated.get(variable.name)
+        if variable.name in whole:
+            variable.min, variable.max = map(whole[variable.name].get, ("min", "max"))
         if (declared := variable.declaredType) is not None:
             for name in OF_TYPES:
                 if getattr(variable, name) is None:

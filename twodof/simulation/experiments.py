@@ -18,7 +18,7 @@ from typing import TypedDict
 from ..bounds import MIN_STEP
 from ..errors import InputError
 from ..fmu import Fmu, load_fmu
-from .input_values import Changes, Setting, Value, read_changes, resolve
+from .input_values import Changes, Setting, Value, read_changes, resolve, resolve_all
 
 TIME_TOLERANCE = 1e-9  # fraction of a communication step
 NANOSECONDS = 1_000_000_000
@@ -39,6 +39,7 @@ class Experiment:
         changes: times, s, and the inputs that change at them, after the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
         signals: names of the Real outputs that samples have as ``signals``.
+        texts: given start values of variables of type String.
         commanders: times in s, and facts of each node whose commands are followed from that time on.
     """
 
@@ -51,6 +52,7 @@ class Experiment:
     changes: Changes
     stamp_start: float | None
     signals: tuple[str, ...] = ()
+    texts: Mapping[str, str] = field(default_factory=dict)
     commanders: list[tuple[float, dict[str, str]]] = field(default_factory=list)
 
     def __repr__(self) -> str:
@@ -118,7 +120,7 @@ def experiment(
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
     start_time, stop_time, step = _times(fmu, start_time, stop_time, step)
-    given = resolve(fmu, settings or {})
+    given, texts = resolve_all(fmu, settings or {})
     due = _due(fmu, changes or [])
     given = {**pop_until(math.nextafter(start_time, -inf), due), **given}
     if input_file is not None:
@@ -138,6 +140,7 @@ def experiment(
         steps=_steps(start_time, stop_time, step),
         start_values={**fmu.start_values, **given},
         given=given,
+        texts=texts,
         changes=[*due],
         stamp_start=stamp_start,
         signals=fmu.real_outputs if signals else (),

@@ -13,6 +13,7 @@ from ..files import check_file
 from ..fmu import Fmu, no_variable
 from ..fmu import Setting as Setting
 from ..fmu import resolve as resolve
+from ..fmu import resolve_all as resolve_all
 from ..plant.numerals import number, whole_number
 from ..plant.variables import GAINS
 from ..plant.variables import Value as Value

@@ -88,7 +88,7 @@ def stepped(
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
-        instance.initialise(run.start_time, run.time(run.steps), run.given)
+        instance.initialise(run.start_time, run.time(run.steps), {**run.given, **run.texts})
         ready()
         take, since = _sampler(instance, run, ignore if judge is None else judge.rows.write), run.start_time
         full = 0
@@ -120,7 +120,7 @@ def stepped(
                 if judge is not None:
                     judge.change(inputs)
                 instance.reset()
-                instance.initialise(since, run.time(run.steps), {**run.given, **inputs, **again})
+                instance.initialise(since, run.time(run.steps), {**run.given, **run.texts, **inputs, **again})
                 instance.step(since, run.step)
 
 

@@ -143,7 +143,7 @@ def trace(run: Experiment, instance: Instance | SystemInstance) -> Array:
 
     It makes no ``Sample`` objects, to save time. Errors are those of ``samples``.
     """
-    instance.initialise(run.start_time, run.time(run.steps), run.given)
+    instance.initialise(run.start_time, run.time(run.steps), {**run.given, **run.texts})
     names = [*chain(*map(run.fmu.vector, OUTPUTS))]
     rows, read, step = bytearray(), instance.reader(names), instance.step
     start, h = run.start_time, run.step
