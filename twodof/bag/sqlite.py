@@ -25,6 +25,7 @@ TABLES = {  # ROS 2's tables and their columns; older versions lack the last one
 }
 READABLE = {*TABLES, "sqlite_master"}
 STEPS = 1000  # instructions of SQLite's virtual machine: all for the schema, and one for each byte of the rows
+MAX_SQL = 4096  # characters of a table's definition; those of ROS 2 have some hundred
 MOST_LOST = 16  # size that a database states to that of its files, which a crash may have shortened
 SOME, SOME_BYTES = 1000, 16 * MIB  # rows in a group, and their size from which it ends
 
@@ -78,6 +79,8 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
             uri = (folder / path.name).as_uri()
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.set_authorizer(_authorize)
+            if sys.version_info >= (3, 11):  # SQLite compares all constraints of a table with each other
+                database.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, MAX_SQL)
             database.execute("PRAGMA writable_schema = ON")  # reads files that lack their end
             database.set_progress_handler(lambda: 1, STEPS)
             # a file can have an index of its schema with other rows
