@@ -7,6 +7,7 @@ import re
 import subprocess
 import zipfile
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import fmpy
@@ -18,11 +19,12 @@ from tools import needs
 
 import twodof
 from twodof.cli.main import main
-from twodof.errors import FmuError, InputError
+from twodof.errors import FmuError, InputError, SimulationError
 from twodof.export.compiler import UNITS
 from twodof.fmu import checking
 from twodof.fmu.description import load_any_fmu
-from twodof.fmu.reference_runs import references_of
+from twodof.fmu.importers import in_this_master
+from twodof.fmu.reference_runs import Reference, references_of
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
 MANIFEST = f"{FOLDER}fmi-ls-manifest.xml"
@@ -186,6 +188,62 @@ def test_two_variables_that_are_exchanged_fail(one: str, other: str, built: Path
         text = re.sub(rf'(name="{re.escape(name)}" valueReference=")\d+', rf"\g<1>{number[1]}", text)
     changed = packed({**files, "modelDescription.xml": text.encode()}, tmp_path / "swapped.fmu")
     assert {name: row.outcome for name, row in rows(changed).items()}["reference push"] == "failed"
+
+
+SAME = ({"q", "q_meas"}, {"v", "v_meas", "der(q)"})
+"""Vectors that are equal, because the controller has no noise, and by their definition."""
+SYMMETRIC, LEVER = {"M[1,2]", "M[2,1]"}, {"x[1]", "J[2,1]"}
+"""Further equal outputs of the arm: its mass matrix, and ∂y/∂q₁ = x of a joint at the origin about z."""
+
+
+def is_noticed(reference: Reference, rows: np.ndarray) -> bool:
+    """Return whether the results of a run fail the reference."""
+    try:
+        reference.judge(rows)
+    except SimulationError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("control", ["task", "joint", "effort"])
+def test_an_output_in_the_place_of_another_fails(control: str, tmp_path: Path) -> None:
+    """The same holds for 0 in its place. Equal outputs are an exception, and have reasons."""
+    options = twodof.FmuOptions(control=control, native=True, reference=True, outputs=("M", "h", "J", "drift"))
+    fmu = load_any_fmu(twodof.build_fmu(tmp_path / "arm.fmu", options))
+    of_states = [name for name in fmu.variables if name.startswith("der(")]
+    unnoticed, all_noticed = set[tuple[str, ...]](), set[tuple[str, ...]]()
+    for reference in references_of(fmu):
+        names = reference.results[0]
+        rows = in_this_master(fmu, reference, names)
+        assert not is_noticed(reference, rows)
+        for (i, name), other in product(enumerate(names), (None, *range(len(names)))):
+            if i != other:
+                changed = rows.copy()
+                changed[:, i] = 0.0 if other is None else rows[:, other]
+                pair: tuple[str, ...] = (name,) if other is None else (name, names[other])
+                (all_noticed if is_noticed(reference, changed) else unnoticed).add(pair)
+    assert {name for name, *_ in all_noticed} == {*fmu.real_outputs, *of_states}
+    for pair in unnoticed - all_noticed:
+        alike = {re.sub(r"\[.*?\]", "", name) for name in pair}
+        own = len({re.sub(r"\D", "", name) for name in pair}) == 1 and any(alike <= vectors for vectors in SAME)
+        assert own or {*pair} in (SYMMETRIC, LEVER), pair
+
+
+@pytest.mark.parametrize("control", ["task", "joint", "effort"])
+def test_each_input_acts_on_results(control: str, tmp_path: Path) -> None:
+    """0 in its place fails. Only a force across the plane of the arm, and damping of no redundant joint, do nothing."""
+    options = twodof.FmuOptions(control=control, native=True, reference=True)
+    fmu = load_any_fmu(twodof.build_fmu(tmp_path / "arm.fmu", options))
+    idle = {name for name, variable in fmu.variables.items() if variable.causality == "input"}
+    for reference in references_of(fmu):
+        names, numbers = reference.stimuli
+        for i, name in enumerate(names, 1):
+            changed = numbers.copy()
+            changed[:, i] = 0.0
+            stimulated = reference._replace(stimuli=(names, changed))
+            if is_noticed(reference, in_this_master(fmu, stimulated, reference.results[0])):
+                idle.discard(name)
+    assert idle == {"f_ext[3]", *(["Kn"] if control == "task" else [])}
 
 
 def test_a_compiler_of_another_maker_leaves_it_within_the_tolerance(changed: Changed) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from ..errors import BuildError
 from ..plant.plant import Plant
 from ..plant.robot import Robot
-from ..plant.variables import OF_LINKS, Variable
+from ..plant.variables import OF_LINKS, ON_REQUEST, Variable
 from .closed_form import Array, responses
 from .fmi3_files import xml_text
 
@@ -44,7 +44,8 @@ IDEAL: dict[str, float | bool] = {
     **{"v_from_q": False, "limit_effort": False, **TIGHT},
 }
 """Parameters with which the motion is smooth, by group."""
-GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau", "q_meas", "v_meas")
+GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau", "q_meas", "v_meas", "der_q", "der_v")
+"""Groups with results in both experiments; outputs on request have results in "push"."""
 PART = 0.01  # payload and rotors of "push", relative to the robot's inertia
 Columns = dict[str, Array]
 
@@ -72,7 +73,8 @@ def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[st
                 _set(plant, names[key], value)
             plant.initialise()
         stimuli = _stimuli(plant, names, values, name == "push")
-        found = [_solve(plant, names, stimuli, method, tolerance) for method, tolerance in SOLVERS.items()]
+        compared = (*GROUPS, *ON_REQUEST) if name == "push" else GROUPS
+        found = [_solve(plant, names, compared, stimuli, method, tolerance) for method, tolerance in SOLVERS.items()]
         tolerance, exact = _tolerance(plant, stimuli, found)
         times: Array = STEP * np.arange(STEPS + 1, dtype=np.float64)
         files[f"{name}-in.csv"] = _csv(times, stimuli)
@@ -159,17 +161,20 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], given: Mapping[str, fl
     return columns
 
 
-def _solve(plant: Plant, names: Mapping[str, Variable], stimuli: Columns, method: str, tolerance: float) -> Columns:
-    """Return the outputs at each communication point by one solver, with inputs held over each step."""
+def _solve(
+    plant: Plant, names: Mapping[str, Variable], groups: Sequence[str], stimuli: Columns, method: str, tolerance: float
+) -> Columns:
+    """Return groups of outputs at each communication point by one solver, with inputs held over each step."""
     from scipy.integrate import solve_ivp  # which takes 0.4 s to import, and most builds have no references
 
     n, rank = len(plant.q), -1
     plant.q, plant.v = list(plant.q_start), list(plant.v_start)
-    outputs = [v for v in names.values() if v.causality == "output" and v.group in GROUPS]
+    outputs = [v for v in names.values() if v.group in groups]
     rows = np.empty((STEPS + 1, len(outputs)))
     for k in range(STEPS + 1):
-        groups = {variable.group for variable in outputs}
-        vectors = {group: getattr(plant, group.removesuffix("_meas")) for group in groups}
+        vectors = {
+            group: getattr(plant, group.removesuffix("_meas")) for group in {variable.group for variable in outputs}
+        }
         rows[k] = [vectors[variable.group][variable.index] for variable in outputs]
         for name, column in stimuli.items():
             _set(plant, names[name], float(column[k]))
@@ -238,7 +243,8 @@ def _closed_form(plant: Plant, stimuli: Columns, solved: Columns) -> Columns:
 def _csv(times: Array, columns: Columns) -> bytes:
     """Return a CSV with twelve digits, which are equal on all machines."""
     rows = [[f"{value:.12g}" for value in row] for row in np.column_stack([times, *columns.values()])]
-    return "".join(f"{','.join(row)}\n" for row in [["time", *columns], *rows]).encode()
+    names = [f'"{name}"' if "," in name else name for name in columns]
+    return "".join(f"{','.join(row)}\n" for row in [["time", *names], *rows]).encode()
 
 
 def parameter_set(name: str, rows: Iterable[tuple[str, str, str]]) -> bytes:
