@@ -19,6 +19,8 @@ from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.identification import stretches
 from twodof.identification.estimate import Misfit, Suspect
+from twodof.identification.fitting import read_model
+from twodof.identification.regression import modelled, rows_of
 
 ARM = Path(__file__).parents[1] / "urdf" / "2dof.urdf"
 GRAVITY = (0.0, -9.81, 0.0)
@@ -92,6 +94,18 @@ def test_of_a_long_recording_evenly_spread_parts_are_used(bag, monkeypatch, capl
         assert np.ptp(begins) < 0.1 and begins.mean() > 2.0
     for p in result.parameters:
         assert abs(p.after - TRUTH[p.name]) <= 4.0 * p.deviation
+
+
+@pytest.mark.parametrize(("free", "columns"), [(["friction[*]"], 0), (["mass:link1"], 10), (["payload"], 10)])
+def test_rows_have_columns_of_the_links_that_vary_alone(bag, free, columns):
+    """Those of all links take gigabytes for 60 joints; the efforts are the same."""
+    whole = read_model(ARM, [*free, "inertia:*"]).parameters(GRAVITY)
+    some = read_model(ARM, free).parameters(GRAVITY)
+    fitted, _ = stretches.stretches([twodof.read_bag(bag)], some.robot)
+    values = some.dynamics(some.start)
+    for few, all_rows in zip(*(rows_of(each, values, fitted, 0.0, True) for each in (some, whole))):
+        assert (few.Y.shape[1], all_rows.Y.shape[1]) == (columns + 1, 21)
+        np.testing.assert_allclose(modelled(few, values), modelled(all_rows, values), atol=1e-12)
 
 
 def test_only_numbers_of_the_urdf_change(bag):

@@ -115,7 +115,7 @@ def estimate(
         last = k == PASSES - 1  # for the tests of offsets
         if not rows or relinearise or last or abs(z[-1] - rows[0].about[1]) > LARGEST_SHIFT:
             about = parameters.dynamics(parameters.values(z[:-1]))
-            rows = rows_of(parameters.robot, about, stretches, float(z[-1]), relinearise or last)
+            rows = rows_of(parameters, about, stretches, float(z[-1]), relinearise or last)
         sd = sd or [np.full(len(each.tau), FIRST_NOISE * np.sqrt(np.mean(each.tau**2))) for each in rows]
         solved = _solve(parameters, rows, sd, z, start, low, scales, LAST_STEPS if last else STEPS)
         z = solved.x

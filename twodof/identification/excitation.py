@@ -153,7 +153,8 @@ class _Design:
 
     def _covariance(self, stretch: Stretch) -> Array:
         """Return the covariance of the coordinates, in their scales."""
-        Y, G = regressors(self._robot, stretch, self._values.offset)
+        varying = self._parameters.varying
+        Y, G = regressors(self._robot, stretch, self._values, varying)
         offsets = any(free.group == "offset" for free in self._parameters.free)
         turning = position_derivatives(self._robot, self._values, stretch, offsets)
         rate, none = np.gradient(stretch.tau, stretch.step, axis=0), np.zeros(len(Y), np.int64)
@@ -162,7 +163,7 @@ class _Design:
         rows = []
         for i, (sign, v, a, tau, tau_rate) in enumerate(signals.transpose(2, 0, 1)):
             gravity = G[:, :, i].swapaxes(0, 1)
-            rows.append(Rows(i, Y[:, i], gravity, sign, v, a, tau, tau_rate, turning[:, i], none, about))
+            rows.append(Rows(i, varying, Y[:, i], gravity, sign, v, a, tau, tau_rate, turning[:, i], none, about))
         sd = [np.full(len(Y), noise) for noise in self._noise]
         J = information_root(self._parameters, rows, sd, self._z) * self._scales
         return np.asarray(np.linalg.inv(J.T @ J + PRIOR**-2 * np.eye(len(self._z)))[:-1, :-1])

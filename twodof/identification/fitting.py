@@ -187,8 +187,8 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
     values = parameters.dynamics(parameters.start)
     stretch = max(fitted, key=lambda each: len(each.t))
     few = stretch.part(slice(None, None, max(1, len(stretch.t) // 200)))
-    Y, G = regressors(robot, few, values.offset)
-    model = Y @ values.inertial + np.einsum("g,kgij,j->ki", values.gravity, G, values.inertial)
+    Y, G = regressors(robot, few, values, np.empty(0, np.int64))
+    model = Y[:, :, 0] + np.einsum("g,kgi->ki", values.gravity, G[:, :, :, 0])
     ours, theirs = np.sqrt(np.mean(model**2, axis=0)), np.sqrt(np.mean(few.tau**2, axis=0))
     for joint, effort in zip(robot.joints, theirs):
         if not effort:

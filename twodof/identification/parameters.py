@@ -188,6 +188,14 @@ class Parameters:
         """Names of the coordinates, without the axes."""
         return tuple(_of_all(free) for free in self.free for _ in range(free.size))
 
+    @property
+    def varying(self) -> NDArray[np.int64]:
+        """Indices of the inertial parameters of the bodies that the free parameters change."""
+        bodies = {self.bodies[free.place] for free in self.free if free.group in ("mass", "com", "inertia")}
+        if any(free.group in ("payload", "payload_com") for free in self.free):
+            bodies.add(self._end[0])
+        return np.array([10 * body + k for body in sorted(bodies - {-1}) for k in range(10)], np.int64)
+
     def with_errors(self, x: Array) -> tuple[Parameters, Array, NDArray[np.bool_]]:
         """Free gravity, offsets and gains, too; return these parameters, coordinates, and which of them are new."""
         more = copy(self)

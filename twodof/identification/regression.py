@@ -26,7 +26,7 @@ from scipy.interpolate import make_interp_spline
 
 from ..plant.robot import Robot
 from .inertials import model_with
-from .parameters import Dynamics
+from .parameters import Dynamics, Parameters
 from .stretches import Array, Stretch
 
 LEAST_SAMPLES, LONGEST = 12, 400
@@ -40,8 +40,9 @@ class Rows(NamedTuple):
 
     Attributes:
         joint: index of the joint.
-        Y: regressor of the inertial parameters without gravity, K × 10·bodies.
-        G: regressors per m/s² of gravity along x, y and z of the root, 3 × K × 10·bodies.
+        varying: indices of the m inertial parameters that vary, of 10·bodies; the others have the URDF's values.
+        Y: regressor of the varying inertial parameters without gravity, and the effort of the others, K × (m + 1).
+        G: the same per m/s² of gravity along x, y and z of the root, 3 × K × (m + 1).
         sign, v, a: regressors of friction, damping and armature, K each.
         tau, tau_rate: recorded effort and its derivative, K.
         offsets: derivative of the inverse dynamics with respect to positions, K × n.
@@ -50,6 +51,7 @@ class Rows(NamedTuple):
     """
 
     joint: int
+    varying: NDArray[np.int64]
     Y: Array
     G: Array
     sign: Array
@@ -62,40 +64,48 @@ class Rows(NamedTuple):
     about: tuple[Array, float]
 
 
-def regressors(robot: Robot, stretch: Stretch, offset: Array) -> tuple[Array, Array]:
-    """Return Y, N × n × 10·bodies, without gravity, and G, N × 3 × n × 10·bodies, of gravity along each axis.
+def regressors(robot: Robot, stretch: Stretch, values: Dynamics, varying: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return Y, N × n × (m + 1), without gravity, and G, N × 3 × n × (m + 1), of gravity along each axis.
+
+    The last column is the effort of the inertial parameters that do not vary.
 
     Args:
         robot: the robot.
         stretch: samples of its motion.
-        offset: true minus measured positions, rad or m, n.
+        values: true minus measured positions, and inertial parameters.
+        varying: indices of the m inertial parameters that vary.
     """
     model = robot.model.copy()
     data, n = model.createData(), len(robot.joints)
     C = np.eye(n) if robot.coupling is None else robot.coupling
-    q, v, a = (stretch.q + offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T
+    q, v, a = (stretch.q + values.offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T
     model.gravity.linear = np.zeros(3)
     count = 10 * (model.njoints - 1)
-    Y, G = np.empty((len(q), n, count)), np.empty((len(q), 3, n, count))
+    columns = np.zeros((count, len(varying) + 1))
+    columns[varying, range(len(varying))] = 1.0
+    columns[:, -1] = values.inertial
+    columns[varying, -1] = 0.0
+    Y, G = np.empty((len(q), n, len(columns.T))), np.empty((len(q), 3, n, len(columns.T)))
     still = np.zeros(model.nv)
     regressor = pin.computeJointTorqueRegressor
-    for k in range(len(q)):
-        Y[k] = C.T @ regressor(model, data, q[k], v[k], a[k]).reshape(-1, count)  # one joint: Pinocchio has a vector
+    for k in range(len(q)):  # one joint: Pinocchio has a vector
+        Y[k] = C.T @ regressor(model, data, q[k], v[k], a[k]).reshape(-1, count) @ columns
     for axis in range(3):
         model.gravity.linear = np.eye(3)[axis]
         for k in range(len(q)):
-            G[k, axis] = C.T @ regressor(model, data, q[k], still, still).reshape(-1, count)
+            G[k, axis] = C.T @ regressor(model, data, q[k], still, still).reshape(-1, count) @ columns
     return Y, G
 
 
 def rows_of(
-    robot: Robot, values: Dynamics, stretches: Sequence[Stretch], delay: float, with_offsets: bool
+    parameters: Parameters, values: Dynamics, stretches: Sequence[Stretch], delay: float, with_offsets: bool
 ) -> list[Rows]:
     """Return the rows of each joint, linearised at values of the parameters and a delay of the efforts, s."""
+    robot, varying = parameters.robot, parameters.varying
     found: list[list[Rows]] = [[] for _ in robot.joints]
     about = (values.offset, delay)
     for stretch in stretches:
-        Y, G = regressors(robot, stretch, values.offset)
+        Y, G = regressors(robot, stretch, values, varying)
         turning = position_derivatives(robot, values, stretch, with_offsets)
         late = _delayed(stretch, delay)
         rate = np.gradient(late, stretch.step, axis=0)
@@ -117,7 +127,7 @@ def rows_of(
                 bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
                 gravity = parts[1].reshape(keep, 3, size).transpose(1, 0, 2)
                 sign, v, a, tau, tau_rate = parts[3].T
-                rows.append(Rows(i, parts[0], gravity, sign, v, a, tau, tau_rate, parts[2], bins, about))
+                rows.append(Rows(i, varying, parts[0], gravity, sign, v, a, tau, tau_rate, parts[2], bins, about))
     return [_joined(rows) for rows in found]
 
 
@@ -185,9 +195,14 @@ def residual(rows: Rows, values: Dynamics, delay: float) -> Array:
 def modelled(rows: Rows, values: Dynamics) -> Array:
     """Return the effort that the model gives, N·m or N."""
     i = rows.joint
-    links = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ values.inertial
+    links = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ _inertial(rows, values)
     joint = values.friction[i] * rows.sign + values.damping[i] * rows.v + values.armature[i] * rows.a
     return np.asarray(links + joint + rows.offsets @ (values.offset - rows.about[0]))
+
+
+def _inertial(rows: Rows, values: Dynamics) -> Array:
+    """Return what the columns of Y and G are multiplied with, m + 1."""
+    return np.append(values.inertial[rows.varying], 1.0)
 
 
 def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
@@ -199,8 +214,8 @@ def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
         rates: derivatives of the values with respect to the coordinates, which are the last axis.
     """
     i, gain = rows.joint, values.gain[rows.joint]
-    columns = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ rates.inertial
-    columns += np.einsum("kij,j->ik", rows.G, values.inertial) @ rates.gravity + rows.offsets @ rates.offset
+    columns = (rows.Y + np.tensordot(values.gravity, rows.G, 1))[:, :-1] @ rates.inertial[rows.varying]
+    columns += np.einsum("kij,j->ik", rows.G, _inertial(rows, values)) @ rates.gravity + rows.offsets @ rates.offset
     for group, column in (("friction", rows.sign), ("damping", rows.v), ("armature", rows.a)):
         columns += np.outer(column, getattr(rates, group)[i])
     columns -= np.outer(modelled(rows, values) / gain, rates.gain[i])
@@ -210,5 +225,5 @@ def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
 def stretched(rows: Rows, values: Dynamics) -> Array:
     """Return the derivative of ``residual`` with respect to the part by which speeds are too low, by a wrong clock."""
     i = rows.joint
-    twice = rows.Y @ values.inertial + values.armature[i] * rows.a
+    twice = rows.Y @ _inertial(rows, values) + values.armature[i] * rows.a
     return np.asarray(-(2.0 * twice + values.damping[i] * rows.v) / values.gain[i])
