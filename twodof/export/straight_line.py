@@ -24,7 +24,7 @@ STRUCTS = {"turn": "JointPosition"}
 """Result types of C functions that return a struct."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Expression:
     """A value in C: a variable, or an operation on expressions and numbers.
 
