@@ -32,6 +32,15 @@ slave.doStep(0.0, 0.01)
 slave.terminate()
 slave.freeInstance()
 """
+BARE = """
+from importlib import import_module
+from pathlib import Path
+
+class TwoDof(import_module(f"twodof_{Path(__file__).stem[6:]}.pythonfmu.fmi2slave").Fmi2Slave):
+    def do_step(self, time, step):
+        return True
+"""
+"""A slave without a plant, whose imports take valgrind a second in place of a minute."""
 
 
 def original() -> bytes:
@@ -79,13 +88,14 @@ def from_c(folder: Path, guid: str, scratch: Path) -> tuple[list[str], dict[str,
 @pytest.mark.parametrize("host", [in_fmpy, from_c])
 def test_the_process_ends_without_use_of_freed_memory(unzipped, tmp_path, host):
     guid = fmpy.read_model_description(str(unzipped)).guid
-    valgrind = [needs("valgrind"), "-q", "--error-limit=no"]
+    valgrind = [needs("valgrind"), "-q", "--error-limit=no", "--undef-value-errors=no"]  # which take half of its time
     command, variables = host(unzipped, guid, tmp_path)
     reports = []
-    for library in ((unzipped / LIBRARY).read_bytes(), original()):
-        (unzipped / LIBRARY).write_bytes(library)
+    for _ in ("repaired", "original"):
         done = subprocess.run([*valgrind, *command], env={**os.environ, **variables}, capture_output=True, text=True)
         reports.append(done.stderr)
+        (unzipped / LIBRARY).write_bytes(original())
+        next((unzipped / "resources").glob("slave_*.py")).write_text(BARE)
     assert done.returncode == 0, reports  # valgrind's heap is none that is damaged
     assert "TwoDof.so" not in reports[0] and "_dl_call_fini" not in reports[0], reports[0]
     assert "finalizePythonInterpreter" in reports[1]  # valgrind does see it in the original
