@@ -263,7 +263,7 @@ def test_a_flood_of_requests_does_not_delay_updates(command, page):
             for k in range(30):
                 target = 0.1 + k / 1000
                 other.send(json.dumps(["change", {"x_des[1]": target}]))
-                while json.loads(other.recv(timeout=5.0))["values"]["x_des[1]"] != target:
+                while json.loads(other.recv(timeout=browser.TIMEOUT))["values"]["x_des[1]"] != target:
                     pass
         finally:
             stopped.set()

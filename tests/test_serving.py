@@ -114,7 +114,7 @@ def test_port_that_another_is_about_to_serve():
 def test_unexpected_requests_of_a_page_are_answered(method):
     """Methods other than GET get status 405, for example with curl -I."""
     with Server(b"page", port=0) as server:
-        asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)
+        asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=60)
         asking.request(method, "/")
         answer = asking.getresponse()
         assert (answer.status, answer.getheader("Allow"), answer.read()) == (405, "GET", b"")
@@ -127,7 +127,7 @@ def test_connections_without_a_request_are_bounded() -> None:
         before = len(os.listdir("/proc/self/fd"))
         for _ in range(5 * MOST_CONNECTIONS):
             idle.enter_context(browser.connected(page.url, "127.0.0.1"))
-        with urllib.request.urlopen(page.url, timeout=10) as answer:
+        with urllib.request.urlopen(page.url, timeout=60) as answer:
             assert answer.read() == b"page"
         assert len(os.listdir("/proc/self/fd")) - before < 6 * MOST_CONNECTIONS + 10
         held.ping().wait(10)
@@ -146,5 +146,5 @@ def test_a_request_without_end_is_cut_off(begin: bytes) -> None:
 def test_a_page_on_all_addresses_is_opened_as_printed(host):
     with Server(b"page", host, 0) as server:
         assert f"//{host}:" not in server.url and "[::]" not in server.url
-        with urllib.request.urlopen(server.url, timeout=10) as answer:
+        with urllib.request.urlopen(server.url, timeout=60) as answer:
             assert answer.read() == b"page"
