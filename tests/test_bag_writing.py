@@ -1,13 +1,16 @@
 """A bag while it is written: location, early ends, memory and disk."""
 
 import fcntl
+import multiprocessing
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Timer
@@ -78,28 +81,18 @@ def written(run: Experiment, path: Path, samples: int, *, overwrite: bool = Fals
             bag.write(sample(run, k))
 
 
-OVERWRITE = """
-import os, signal, sys
-import twodof
-from bags import sample
-from itertools import count
+def overwrite(run: Experiment, path: Path, moment: int) -> None:
+    """Overwrite a bag, and kill the process at a change of a folder, by number."""
+    moments = count(1)
 
-fmu, path, moment = sys.argv[1:]
-calls, moments = dict.fromkeys(("mkdir", "rename", "unlink", "rmdir")), count(1)
+    def killed(change: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        if next(moments) == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return change(*arguments, **named)
 
-def killed(name, *arguments, **named):
-    if next(moments) == int(moment):
-        os.kill(os.getpid(), signal.SIGKILL)
-    return calls[name](*arguments, **named)
-
-run = twodof.experiment(fmu)
-for name in calls:
-    calls[name] = getattr(os, name)
-    setattr(os, name, lambda *arguments, name=name, **named: killed(name, *arguments, **named))
-with twodof.Bag(path, overwrite=True).begin(run) as bag:
-    bag.write(sample(run, 0))
-    bag.write(sample(run, 1))
-"""
+    for name in ("mkdir", "rename", "unlink", "rmdir"):
+        setattr(os, name, partial(killed, getattr(os, name)))
+    written(run, path, 2, overwrite=True)
 
 
 def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one(run, tmp_path):
@@ -108,7 +101,9 @@ def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one
     written(run, path, 5)
     keep = shutil.copytree(path, tmp_path / "keep")
     for moment in count(1):
-        done = python("-c", OVERWRITE, run.fmu.path, path, str(moment), cwd=HERE)
+        process = multiprocessing.get_context("fork").Process(target=overwrite, args=(run, path, moment))
+        process.start()
+        process.join()
         left.clear()
         for bag in tmp_path.glob("bag*"):
             with suppress(BagError):
@@ -117,8 +112,9 @@ def test_a_run_killed_at_any_moment_leaves_the_old_bag_or_samples_of_the_new_one
         seen |= left.items()
         for bag in tmp_path.glob("bag*"):
             shutil.rmtree(bag)
-        if done.returncode == 0:
+        if process.exitcode == 0:
             break
+        assert process.exitcode == -signal.SIGKILL
         shutil.copytree(keep, path)
     assert seen >= {("bag", 5), ("bag.replaced", 5), ("bag", 2)}
     assert not any(file for folder in tmp_path.iterdir() if folder != keep for file in folder.iterdir())
