@@ -38,8 +38,9 @@ def ran(folder: Path, text: str, *options: str, ci: str = "") -> subprocess.Comp
         "TMPDIR": str(folder / "tmp"),
         "PYTHONPATH": str(HERE),
         "CI": ci,
+        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
     }
-    return python("-m", "pytest", *options, folder, cwd=folder, env=environment)
+    return python("-m", "pytest", "-p", "xdist", "-p", "randomly", *options, folder, cwd=folder, env=environment)
 
 
 def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path):
