@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,14 +15,6 @@ import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.identification import excitation
-
-
-@pytest.fixture(scope="module")
-def motion(tmp_path_factory: pytest.TempPathFactory) -> tuple[twodof.Excitation, Path]:
-    path = tmp_path_factory.mktemp("design") / "excite.csv"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(excitation, "GENERATIONS", 40)
-        return twodof.excite(ARM, 20.0, FREE, gravity=GRAVITY, output=path), path
 
 
 def test_a_motion_is_smooth_and_within_the_limits(tmp_path):
@@ -55,9 +46,10 @@ def test_a_motion_is_smooth_and_within_the_limits(tmp_path):
         np.testing.assert_allclose(each[[0, -1]], 0.0, atol=1e-9)
 
 
-def test_intervals_are_narrower_than_with_random_motions(motion, tmp_path):
+def test_intervals_are_narrower_than_with_random_motions(tmp_path, monkeypatch):
     """The noise of efforts is the same for all motions."""
-    designed, _ = motion
+    monkeypatch.setattr(excitation, "GENERATIONS", 40)
+    designed = twodof.excite(ARM, 20.0, FREE, gravity=GRAVITY)
     rng, recorded = np.random.default_rng(5), []
     k, t, path = np.array([1, 2, 3, 7, 11, 20]), designed.t[::5], designed.q[::5]
     for number in range(4):
@@ -79,15 +71,15 @@ def test_intervals_are_narrower_than_with_random_motions(motion, tmp_path):
     assert designed.factor > 1.9 and gain.min() > 1.25, (designed.factor, gain)
 
 
-def test_the_command_writes_inputs_of_a_run(motion, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(excitation, "GENERATIONS", 40)
+def test_the_command_writes_inputs_of_a_run(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(excitation, "GENERATIONS", 1)
+    motion = twodof.excite(ARM, 20.0, FREE, gravity=GRAVITY, output=tmp_path / "motion.csv")
     free = [word for pattern in FREE for word in ("--free", pattern)]
     output, gravity = tmp_path / "excite.csv", [*map(str, GRAVITY)]
     assert main(["fit", str(ARM), "--design", "20", *free, "--gravity", *gravity, "-o", str(output)]) == 0
     printed = capsys.readouterr().out
-    assert (
-        f"intervals {motion[0].factor:.3g} times narrower" in printed and output.read_bytes() == motion[1].read_bytes()
-    )
+    assert f"intervals {motion.factor:.3g} times narrower" in printed
+    assert output.read_bytes() == (tmp_path / "motion.csv").read_bytes()
     assert "--control joint --set q_start=0,0 " in printed
     options = twodof.FmuOptions(native=True, control="joint", q_start=(0.0, 0.0), settings={"friction": [0.08, 0.05]})
     fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)
