@@ -20,6 +20,9 @@ from twodof.simulation.remedies import Repetition
 from twodof.simulation.repetition import Repeater
 
 CIRCLE = 0.06  # m
+FOLDED = (0.0, 1.5, -1.5, 0.0, 0.0, 0.0, -0.5)
+REACHED_OUT = {"q_des": (0.3, 1.2, -1.2, 0.2, 0.2, 0.2, -0.3)}
+"""A start and a target of a Z1, whose URDF has friction and damping."""
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +30,10 @@ def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Build native FMUs of the default arm under both controls, its system of two FMUs, and a UR5's pose control."""
     folder = tmp_path_factory.mktemp("native")
     ur5 = {"urdf": robots_folder() / UR5, "frame": "ee_link", "q_start": AT_UR5, "meshes": False}
-    options: dict[str, dict[str, Any]] = {"task": {}, "joint": {"control": "joint"}, "pose": {"control": "pose", **ur5}}
+    z1 = {"urdf": robots_folder() / "z1_description/urdf/z1.urdf", "q_start": FOLDED, "meshes": False}
+    options: dict[str, dict[str, Any]] = {
+        "task": {}, "joint": {"control": "joint"}, "pose": {"control": "pose", **ur5}, "z1": {"control": "joint", **z1},
+    }  # fmt: skip
     built = {
         name: twodof.build_fmu(folder / f"{name}.fmu", twodof.FmuOptions(**own, native=True))
         for name, own in options.items()
@@ -58,6 +64,7 @@ def error(summary: twodof.Summary) -> float:
         ("joint", {"q_des": (0.9, 0.8), "friction": (0.3, 0.1)}, "friction", {"friction": 0.0}),
         ("joint", {"q_des": (0.9, 0.8), "control_period": 0.06, "Kd": 60.0}, "unstable", {"control_period": 0.0}),
         ("joint", {"q_des": (0.9, 0.8), "damping": 20.0}, "load", {"damping": 0.0}),
+        ("z1", {**REACHED_OUT, "friction": 0.0}, "drag", {"damping": 0.0}),
         ("joint", {"q_des": (0.9, 0.8), "limit_effort": True, "payload": 10.0, "payload_known": True}, "saturation",
          {"limit_effort": False}),
         ("system", {"plant.payload": 1.0}, "load", {"controller.payload_known": True, "controller.payload": 1.0}),
@@ -357,6 +364,17 @@ def test_the_advice_to_raise_a_gain_is_tried(fmus: dict[str, Path], fmu, setting
     assert ("raise Kp" in first) == helps, first
     if helps:
         assert [*map(float, advice[0])] == [gains["Kp"], pytest.approx(error(stiffer), rel=6e-3)]
+
+
+def test_joints_that_creep_are_named_apart_from_joints_that_stick(fmus: dict[str, Path]) -> None:
+    summary = twodof.simulate(fmus["z1"], settings=REACHED_OUT)
+    sticks, creeps, *_ = summary.verdict.lines
+    joints = summary.judge.setup.joints
+    moving = {name for name, v in zip(joints, summary.last.v) if v}
+    assert {*re.findall(r"'(\w+)'", creeps)} == moving and 0 < len(moving) < 7
+    named = {*re.findall(r"'(\w+)'", sticks.partition(" sticks")[0][-20:] + sticks.partition("likewise")[2])}
+    assert named == {*joints} - moving
+    assert "without friction" in sticks and "without friction" not in creeps  # the same run
 
 
 def test_a_request_to_stop_ends_the_repetitions(fmus: dict[str, Path]) -> None:

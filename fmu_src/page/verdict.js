@@ -14,7 +14,7 @@ const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the shar
 const SINGULAR = 0.02, POSES = 20; // ratio of the smallest to the largest singular value, and examined late poses
 const STILL = 1e-3, CREEPING = 1e-5, FEWEST = 0.2; // part of the largest speed, and rad/s or m/s, at rest; damping ratio
 const TAIL = 256, FAST = 0.25, FADING = 0.7; // examined last samples, reversals in a step that are too many, and decay of the speed
-const SLIGHT = 1e-4, DRAG = 0.02, BALANCED = 9; // loads and efforts of damping, relative to the largest effort; samples of the balance
+const SLIGHT = 1e-4, DRAG = 0.02, BALANCED = 9; // loads, and efforts of damping of a joint, relative to the largest effort; samples of the balance
 const UNSTABLE = 1 + 1e-4, SPOILT = 0.5; // spectral radius, and rate of decay relative to that of a continuous controller
 
 export class Verdict {
@@ -47,7 +47,8 @@ export class Verdict {
   /** @type {(causes: Cause[]) => Cause[]} */
   grouped(causes) {
     return causes.flatMap((each) => {
-      const same = causes.filter(({ kind, noted, joint }) => joint >= 0 && kind === each.kind && noted === each.noted);
+      const same = causes.filter(({ kind, noted, joint, share }) => // a joint that creeps has the share 0
+        joint >= 0 && kind === each.kind && noted === each.noted && share > 0 === each.share > 0);
       if (each.joint < 0) return [each];
       const names = same.length === this.joints.length && same.length > 2 ? "all other joints"
         : same.slice(1).map(({ joint }) => `'${this.joints[joint].name}'`).join(", ");
@@ -245,12 +246,14 @@ export class Verdict {
     return found;
   }
 
-  /** Whether the damping of a joint needs a part of the efforts in the last quarter. */
+  /** Whether damping needs a part of the late effort of a joint with an error. */
   drags() {
-    const { session } = this, late = this.picked(0.25);
-    const most = (/** @type {string} */ group, /** @type {number[]} */ by) =>
-      Math.max(...late.flatMap((k) => by.map((factor, i) => factor * Math.abs(session.value(group, k, i)))));
-    return most("v", [...session.held("damping")]) > DRAG * most("tau", this.joints.map(() => 1));
+    const { session } = this, late = this.picked(0.25), targets = session.held("q_des");
+    /** @type {(group: string, i: number) => number} */
+    const most = (group, i) => Math.max(...late.map((k) => Math.abs(session.value(group, k, i))));
+    const off = this.joints.map((_, i) => (targets.length ? Math.abs(targets[i] - session.value("q", session.count - 1, i)) : 1));
+    const counts = 0.1 * Math.max(...off);
+    return session.held("damping").some((size, i) => off[i] >= counts && size * most("v", i) > DRAG * most("tau", i));
   }
 
   /** Gains of an unstable loop, or else a joint that reverses as fast as the controller's steps. */

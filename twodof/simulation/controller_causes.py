@@ -23,7 +23,7 @@ SPOILT = 0.5  # fraction of the rate of decay of a continuous controller below w
 STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
 OF_ERROR = 0.1  # part of the largest element of an error from which on an element counts
 GRAVITY = 9.81  # m/s²
-DRAG = 0.02  # effort of damping, relative to the largest effort in the last quarter, that counts
+DRAG = 0.02  # effort of damping, relative to the joint's largest effort in the last quarter, that counts
 
 
 def gain_name(judge: Judge, group: str, i: int) -> str:
@@ -137,10 +137,15 @@ def _share(judge: Judge, torque: float) -> float:
 
 
 def _drags(judge: Judge) -> bool:
-    """Return whether the damping of a joint needs a part of the efforts in the last quarter of the run."""
+    """Return whether damping needs a part of the late effort of a joint with an error."""
     v, tau, damping = *(np.abs(judge.history(name)[judge.late]) for name in ("v", "tau")), judge.given("damping")
-    known = v.shape[1] == tau.shape[1] == len(damping)
-    return known and bool((v * damping).max(initial=0.0) > DRAG * tau.max(initial=0.0))
+    if not v.shape[1] == tau.shape[1] == len(damping):
+        return False
+    targets, off = judge.wanted("q"), np.ones(len(damping))
+    if targets.size:
+        off = np.abs(targets - judge.end("q"))
+    drags = (v * damping).max(axis=0, initial=0.0) > DRAG * tau.max(axis=0, initial=0.0)
+    return bool((drags & (off >= OF_ERROR * off.max())).any())
 
 
 def sampled(judge: Judge) -> Iterator[Cause]:

@@ -57,10 +57,14 @@ def lines_of(
 
 
 def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
-    """Return the worst cause of each kind with the joints, of ``count``, of its others, and all causes without one."""
+    """Return the worst cause of each kind with the joints, of ``count``, of its others, and all causes without one.
+
+    A joint that sticks has a time, and one that creeps none.
+    """
     grouped: list[Cause] = []
     for cause in why:
-        same = [other for other in why if other.joint and (other.kind, other.noted) == (cause.kind, cause.noted)]
+        key = cause.kind, cause.noted, cause.time is None
+        same = [other for other in why if other.joint and (other.kind, other.noted, other.time is None) == key]
         if cause not in same:
             grouped.append(cause)
         elif cause is same[0]:
@@ -69,16 +73,24 @@ def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
             names = "all other joints" if len(joints) == count - 1 > 1 else names
             grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
     several = len([cause for cause in grouped if not cause.noted]) > 1
-    return [cause._replace(text=_with_part(cause, several)) for cause in grouped]
+    first = {cause.tried: cause for cause in reversed(grouped)}
+    return [cause._replace(text=_with_part(cause, several, first[cause.tried] is cause)) for cause in grouped]
 
 
-def _with_part(cause: Cause, several: bool) -> str:
+def _with_part(cause: Cause, several: bool, new: bool) -> str:
     """Return a cause's text, before its remedy with the errors without it, or else with its part in the error.
 
-    The part is only printed of one of several causes, and if it is known and less than all of the error.
+    The part is only printed of one of several causes, and if it is known and less than all of the error; the errors,
+    if they are new.
     """
-    part = cause.tried
-    if not part and several and cause.part is not None and cause.kind != "reach" and SMALL <= abs(cause.part) < WHOLE:
+    part = cause.tried if new else ""
+    if (
+        not cause.tried
+        and several
+        and cause.part is not None
+        and cause.kind != "reach"
+        and SMALL <= abs(cause.part) < WHOLE
+    ):
         percent = f"{100.0 * abs(cause.part):.2g} %"
         part = f"{percent} of the error" if cause.part > 0.0 else f"it reduces the error by {percent}"
     text, *remedy = cause.text.split("; ", 1)
