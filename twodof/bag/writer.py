@@ -22,6 +22,8 @@ from .provenance import ProvenanceFile
 from .storage import BATCH_SIZE, OVERHEAD, Stamps
 from .store import Store
 
+CHECKED = 64  # rows from one check of the storing thread to the next
+
 
 class Bag(Sink):
     """A sink that writes a rosbag2 folder.
@@ -116,6 +118,7 @@ class Bag(Sink):
         if self._run is None:
             raise BagError("the bag is not open; open it by 'with bag.begin(experiment):'")
         self._queue: deque[bytes] = deque()  # packed numbers of waiting samples
+        self._rows: deque[bytes] = deque()  # outputs of waiting samples after these
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
         self._verdict: dict[str, object] | None = None
         self._taken = 0  # samples that the thread has taken
@@ -131,6 +134,26 @@ class Bag(Sink):
         self.count += 1
         if self.count == 1 or self.count - self._taken > self._most:
             self._store.flush()
+
+    @property
+    def takes_rows(self) -> bool:
+        """True if outputs are enough, and no derived class has a ``write`` of its own."""
+        return not self._measured and type(self).write is Bag.write
+
+    def take_rows(self, first: Sample) -> Callable[[bytes], object]:
+        """Write the first sample; return a function that writes each further one by its outputs, with equal inputs."""
+        self.write(first)
+        self._first, add, store = first, self._rows.append, self._store
+
+        def write_row(row: bytes) -> None:
+            add(row)
+            self.count += 1
+            if not self.count % CHECKED:
+                store.check()
+                if self.count - self._taken > self._most:
+                    store.flush()
+
+        return write_row
 
     def conclude(self, verdict: Callable[[], Verdict]) -> None:
         """Receive the verdict, to be stored with the provenance."""
@@ -157,20 +180,24 @@ class Bag(Sink):
 
     def hand_over(self) -> None:
         """Pass the queue to the store: changes of inputs first, then the messages that they affect."""
-        samples, changes = list(self._queue), list(self._changes)
+        samples, rows, changes = list(self._queue), list(self._rows), list(self._changes)
         self._provenance.add(changes, self._verdict)
         for _ in changes:
             self._changes.popleft()
         if self._store.fsync and changes:
             sync(self._provenance.path)
-        if samples:
-            stamps, messages = self._messages.of_all(b"".join(samples))
+        if samples or rows:
+            numbers = b"".join(samples)
+            if rows:
+                numbers += self._messages.numbers_of(b"".join(rows), self._first, self._taken + len(samples))
+            stamps, messages = self._messages.of_all(numbers)
             if not self._taken:
                 self._give(stamps[:1], self._messages.latched(stamps[0]))
             self._give(stamps, messages)
-            for _ in samples:
-                self._queue.popleft()
-            self._taken += len(samples)
+            for waiting, taken in ((self._queue, samples), (self._rows, rows)):
+                for _ in taken:
+                    waiting.popleft()
+            self._taken += len(stamps)
 
     def stored(self) -> int:
         """Return the number of samples in the bag."""

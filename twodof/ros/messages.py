@@ -18,8 +18,9 @@ from rosbags.typesys.store import Typestore
 from ..errors import BagError, InputError
 from ..fmu import resource_reader
 from ..plant.urdf import Joint, RobotError
-from ..simulation.experiments import Experiment
+from ..simulation.experiments import NANOSECONDS, Experiment
 from ..simulation.input_values import Value
+from ..simulation.judge import OUTPUTS
 from ..simulation.sample import Sample
 from .cdr import Layout, Numbers, Rows, Stamp, joint_state_layout
 
@@ -190,7 +191,7 @@ class Messages:
         if clock:
             self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
         self._layouts, self._efforts, turns = layouts, efforts, 4 * poses
-        self._measured, seen = measured, n if measured else 0
+        self._measured, self._step, seen = measured, run.step, n if measured else 0
         sizes = {
             "q": n,
             "v": n,
@@ -226,6 +227,22 @@ class Messages:
                 self._target = (*(sample.target or ()), *(sample.target_quat or ()))
             given = (*given, *sample.quat, *self._target)
         return self._pack(sample.stamp, *sample.q, *sample.v, *given)
+
+    def numbers_of(self, rows: bytes, first: Sample, k: int) -> bytes:
+        """Return the packed numbers of samples from index k on, by their OUTPUTS and the inputs of the first sample."""
+        sizes = [len(getattr(first, name)) for name in OUTPUTS]
+        values, begin = np.frombuffer(rows).reshape(-1, sum(sizes)), 0
+        table = np.zeros(len(values), self._numbers)
+        later = np.rint(np.arange(k, k + len(values)) * self._step * NANOSECONDS)
+        table["stamp"] = first.stamp + later.astype(np.int64)
+        for name, size in zip(OUTPUTS, sizes):
+            if name != "x" and table[name].shape[1]:
+                table[name] = values[:, begin : begin + size]
+            begin += size
+        for name, target in (("x_des", first.target), ("quat_des", first.target_quat)):
+            if table[name].shape[1]:
+                table[name] = target
+        return table.tobytes()
 
     def of(self, sample: Sample) -> dict[str, Rows]:
         """Return the messages of one sample, by topic."""

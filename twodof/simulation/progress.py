@@ -44,6 +44,11 @@ def counting(what: str, unit: str, *, shown: bool) -> Iterator[Callable[[int, in
 class Progress(Sink):
     """Progress bar over the simulated time."""
 
+    @property
+    def takes_rows(self) -> bool:
+        """True: the time alone is shown."""
+        return True
+
     def begin(self, run: Experiment) -> Progress:
         """Receive the experiment; return self."""
         self._step = run.step
@@ -53,6 +58,11 @@ class Progress(Sink):
     def write(self, sample: Sample) -> None:
         """Show the time of a sample."""
         self._bar.update(self._step if sample.k else 0.0)
+
+    def take_rows(self, first: Sample) -> Callable[[bytes], object]:
+        """Show the time of the first sample; return a function that shows that of each further one."""
+        self.write(first)
+        return lambda _: self._bar.update(self._step)
 
     def __exit__(self, *exception: object) -> None:
         self._bar.close()

@@ -87,6 +87,15 @@ class Sink:
                 sink.write(sample)
     """
 
+    @property
+    def takes_rows(self) -> bool:
+        """True if ``take_rows`` can stand for ``write``; False here.
+
+        A run whose sinks all take rows, and whose inputs do not change, makes no samples between the first and the last
+        one, to save time.
+        """
+        return False
+
     def begin(self, run: Experiment) -> Self:
         """Receive the experiment of the following samples; return self, a context manager."""
         return self
@@ -99,6 +108,10 @@ class Sink:
 
     def write(self, sample: Sample) -> None:
         """Receive one sample."""
+
+    def take_rows(self, first: Sample) -> Callable[[bytes], object]:
+        """Receive the first sample; return a function that receives OUTPUTS of each further one, as 64-bit numbers."""
+        raise NotImplementedError
 
     def command(self, stop: Callable[[], bool], pace: RealTime | None) -> Mapping[str, Setting] | None:
         """Return new inputs from the latest sample's time on; ``stop`` and ``pace`` are those of the run."""

@@ -9,7 +9,7 @@ The initial state is the first sample, so N steps give N + 1 samples.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import nullcontext
 from itertools import accumulate, chain, count
 from math import dist, isfinite
@@ -31,6 +31,7 @@ from .setup import setup_of
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+OF_A_SAMPLE = (*OUTPUTS, "q_meas", "v_meas")
 LARGE = 1e5  # in a setting's unit: larger settings are probably mistakes
 FAR = 50.0  # m: a target farther from the end effector is probably in millimetres
 
@@ -124,6 +125,51 @@ def stepped(
                 instance.step(since, run.step)
 
 
+def stepped_rows(
+    run: Experiment,
+    judge: Judge,
+    stop: Stop,
+    ready: Callable[[], object],
+    first: Callable[[Sample], Sequence[Callable[[bytes], object]]],
+    instance: Instance | SystemInstance,
+) -> Sample:
+    """Step an FMU whose inputs do not change, and return the last sample.
+
+    It makes no samples between the first and the last one, which take as long as a step of a fast FMU.
+
+    Args:
+        run, judge, stop, ready, instance: as of ``stepped``.
+        first: receives the first sample; returns functions that receive the outputs of each further one as bytes.
+    """
+    inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
+    instance.initialise(run.start_time, run.time(run.steps), {**run.given, **run.texts})
+    ready()
+    take, start, h, step = _sampler(instance, run, ignore), run.start_time, run.step, instance.step
+    sample = take(0, inputs, start)
+    groups = [run.fmu.vector(group) for group in OUTPUTS]
+    read, unpack = instance.reader([*chain(*groups)]), Struct(f"{sum(map(len, groups))}d").unpack
+    row, k, watch = bytes(read()), 0, judge.rows.write
+    watch(row)
+    judge.flush()
+    adds = first(sample)
+    while k < run.steps and not stop():
+        try:
+            step(start + k * h, h)
+        except SimulationError as error:
+            sample_of = _maker(run, [*accumulate(len(run.fmu.vector(group)) for group in OF_A_SAMPLE)], sample.stamp)
+            _resumed(run, sample_of(k, unpack(row), inputs, start), error, ignore)
+        row, k = bytes(read()), k + 1
+        values = unpack(row)
+        if not isfinite(sum(values)) and not all(map(isfinite, values)):
+            raise diverged(k, run.time(k))
+        watch(row)
+        for add in adds:
+            add(row)
+        if not k % BLOCK:
+            judge.flush()
+    return take(k, inputs, start)
+
+
 def as_experiment(
     run: Experiment | Fmu | str | Path, options: ExperimentOptions, usual: ExperimentOptions | None = None
 ) -> Experiment:
@@ -145,26 +191,37 @@ def _sampler(
     instance: Instance | SystemInstance, run: Experiment, watch: Callable[[memoryview], object]
 ) -> Callable[[int, Mapping[str, Value], float], Sample]:
     """Return a function that reads the outputs after k steps, with the inputs and their start time."""
-    groups = [run.fmu.vector(group) for group in (*OUTPUTS, "q_meas", "v_meas")]
+    groups = [run.fmu.vector(group) for group in OF_A_SAMPLE]
     ends = list(accumulate(map(len, groups)))
     read, unpack = instance.reader([*chain(*groups)]), Struct(f"{ends[-1]}d").unpack
-    of_q, of_v, of_x, of_tau, *of_rest = (slice(a, b) for a, b in zip([0, *ends], ends))
     judged = memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # a view of the buffer that all reads use
     signals = instance.reader(run.signals) if run.signals else tuple
-    start, step, first_stamp = run.start_time, run.step, run.first_stamp()
+    sample_of = _maker(run, ends, run.first_stamp())
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
-        t, row = start + k * step, read()
-        values = unpack(row)
+        values = unpack(read())
         if not isfinite(sum(values)) and not all(map(isfinite, values)):
-            raise diverged(k, t)
+            raise diverged(k, run.time(k))
         watch(judged)
+        return sample_of(k, values, inputs, since, tuple(signals()))
+
+    return take
+
+
+def _maker(run: Experiment, ends: Sequence[int], first_stamp: int) -> Callable[..., Sample]:
+    """Return a function that makes the sample after k steps; outputs whose ends are beyond its values are empty."""
+    of_q, of_v, of_x, of_tau, *of_rest = (slice(a, b) for a, b in zip([0, *ends], ends))
+    start, step = run.start_time, run.step
+
+    def sample_of(
+        k: int, values: tuple[float, ...], inputs: Mapping[str, Value], since: float, signals: tuple[float, ...] = ()
+    ) -> Sample:
         stamp = first_stamp + round(k * step * NANOSECONDS)
         parts = values[of_q], values[of_v], values[of_x], values[of_tau]
         quat, q_meas, v_meas = (values[of] for of in of_rest)
-        return Sample(k, t, *parts, inputs, since, stamp, quat, q_meas, v_meas, tuple(signals()))
+        return Sample(k, start + k * step, *parts, inputs, since, stamp, quat, q_meas, v_meas, signals)
 
-    return take
+    return sample_of
 
 
 def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Resume) -> dict[str, Value]:
