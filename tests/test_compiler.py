@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import pwd
 import struct
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from native_models import model
@@ -64,6 +67,26 @@ def test_a_library_is_kept_for_its_sources(kept):
     assert answer(1) == first == answer(1)
 
 
+@pytest.mark.parametrize("platform", ["linux64", "win64"])
+def test_another_virtual_environment_takes_a_kept_library(kept, monkeypatch, platform):
+    """A command has the path of Python, and for Windows that of zig's headers."""
+    monkeypatch.setattr(compiler, "_run", copied)
+    first = compile_library({"a.c": b"1"}, platform, "Arm", units=["a.c"])
+    found = importlib.util.find_spec("ziglang")
+    assert found is not None
+    origin = str(found.origin).replace(sys.prefix, "/other")
+    monkeypatch.setattr(compiler, "ZIG", ("/other/bin/python", *compiler.ZIG[1:]))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: SimpleNamespace(origin=origin))
+    monkeypatch.setattr(sys, "prefix", "/other")
+    monkeypatch.delattr(compiler, "_run")
+    assert compile_library({"a.c": b"1"}, platform, "Arm", units=["a.c"]) == first
+
+
+def copied(command, folder, environment):
+    """Copy the source in place of compiling it."""
+    Path(command[-1]).write_bytes((folder / "a.c").read_bytes())
+
+
 def test_libraries_that_are_not_used_are_not_kept(kept):
     answer(1)
     (used,) = kept.iterdir()
@@ -80,11 +103,6 @@ def test_libraries_that_are_not_used_are_not_kept(kept):
 def given_away(path):
     needs("root")
     os.chown(path, 65534, 65534)
-
-
-def copied(command, folder, environment):
-    """Copy the source in place of compiling it."""
-    Path(command[-1]).write_bytes((folder / "a.c").read_bytes())
 
 
 @pytest.mark.parametrize("change", [given_away, lambda path: path.chmod(0o777)])

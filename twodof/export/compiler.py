@@ -204,7 +204,8 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str, 
             cache = zig_cache()
             environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache or folder / "zig-cache")
             environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # for these sources only
-            made_of = hashlib.sha256(repr((version("ziglang"), *command, output)).encode())
+            parts = repr((version("ziglang"), *command[1:], output))
+            made_of = hashlib.sha256(parts.replace(sys.prefix, "").encode())  # equal in all virtual environments
             for file, content in sorted(sources.items()):
                 made_of.update(repr((file, len(content))).encode() + content)
             kept = cache / FOLDER / made_of.hexdigest() if cache else None
