@@ -144,7 +144,7 @@ def test_stamp_out_of_the_range_of_ros_is_refused(native_path, start):
 @pytest.mark.parametrize("now", [-1, (2**31) * SECOND])
 def test_wall_clock_out_of_the_range_of_ros_is_refused(native_path, now, monkeypatch):
     monkeypatch.setattr(time, "time_ns", lambda: now)
-    with pytest.raises(InputError, match="from the wall clock on are not those of 1970 to 2038"):
+    with pytest.raises(InputError, match="from the wall clock on with a duration of 5 s are not within 1970 to 2038"):
         twodof.experiment(native_path)
 
 

@@ -372,6 +372,13 @@ def test_names_of_a_urdf_are_text_in_all_that_the_fmu_holds(native, tmp_path):
         assert f"of joint '{joint}"[:400] in message
 
 
+def test_joints_are_to_stay_where_they_start(tmp_path):
+    """A start position beyond the limits is clamped, and so is the target that it gives."""
+    fmu = build_fmu(tmp_path / "x.fmu", FmuOptions(control="joint", settings={"q_start": 9.0}))
+    variables = {v.name: v.start for v in read_model_description(str(fmu)).modelVariables}
+    assert [float(variables[f"q_des[{i}]"]) for i in (1, 2)] == [np.pi, np.pi]
+
+
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(TwoDofError, match=r"cannot write '.*nowhere/A\.fmu'"):
         build_fmu(tmp_path / "nowhere" / "A.fmu")

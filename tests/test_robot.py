@@ -333,6 +333,13 @@ def test_friction_is_read_without_a_warning() -> None:
     assert (loaded.damping, loaded.friction, loaded.warnings) == ((0.0, 0.5), (0.0, 0.1), ())
 
 
+@pytest.mark.parametrize(("most", "warned"), [(180.0, True), (6.3, False), (1e16, False)])
+def test_limits_in_degrees_are_warned_of(most: float, warned: bool) -> None:
+    wide = elbow(f'<limit lower="-{most}" upper="{most}" effort="7" velocity="1"/>')
+    warnings = load_robot(arm(elbow=wide), "tip", "xyz").warnings
+    assert warnings == ("limits of more than 25 rad may be in degrees: joint 'elbow'",) * warned
+
+
 @pytest.mark.parametrize("inside", ["", 'lower="0.5" upper="0.5"'])
 def test_a_joint_that_its_limits_freeze_is_warned_of(inside: str) -> None:
     still = elbow(f'<limit {inside} effort="7" velocity="1"/>')

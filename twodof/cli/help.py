@@ -55,6 +55,7 @@ EXAMPLES = {
     ],
     "recover": ["twodof recover my_bag"],
 }
+ALIKE = 0.7  # ratio of difflib from which on a verb or option may be meant
 MEANT = {
     "simulate": "run",
     "show": "info",
@@ -80,6 +81,14 @@ MEANT = {
     "ros": "publish",
     "--dt": "--step",
     "--timestep": "--step",
+    "--step-size": "--step",
+    "--start-time": "--stamp-start",
+    "--stepsize": "--step",
+    "--output-interval": "--step",
+    "--tolerance": "--set rtol=1e-6",
+    "--rtol": "--set rtol=1e-6",
+    "--start-values": "--set",
+    "--parameters": "--set",
     "--duration": "--stop-time",
     "--time": "--stop-time",
     "--stop": "--stop-time",
@@ -174,11 +183,14 @@ def check_arguments(parser: Parser, unknown: Sequence[str]) -> None:
         parser.error(f"there is no option '{word}'{_meant(word, known) or lists}")
     if "=" in unknown[0] and "--set" in known:
         parser.error(f"'{unknown[0]}' belongs to no option: repeat --set, as in --set {unknown[0]}")
-    parser.error(f"'{unknown[0]}' is one argument too many{lists}")
+    name = f"; a name for what the command writes needs -o, as in -o {unknown[0]}" if "-o" in known else ""
+    parser.error(f"'{unknown[0]}' is one argument too many{name}{lists}")
 
 
 def _meant(word: str, known: Sequence[str]) -> str:
-    meant = MEANT.get(word)
-    if meant not in known:
-        meant = nearest(word.replace("_", "-"), known)
+    """Return a question for the verb or option that is probably meant; "" for none."""
+    meant = MEANT.get(word, "")
+    if meant.partition(" ")[0] not in known:
+        bare = {name.lstrip("-"): name for name in known}  # dashes make all options alike
+        meant = bare.get(nearest(word.lstrip("-").replace("_", "-"), bare, ALIKE) or "", "")
     return f"; did you mean '{meant}'?" if meant else ""

@@ -162,6 +162,8 @@ def _model(options: FmuOptions, robot: Robot, links: Sequence[Variable]) -> tupl
         plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
         for warning in plant.initialise():
             logger.warning("%s", warning)
+        if "q_des" in CONTROLS[options.control].inputs:
+            starts["q_des"] = tuple(plant.q)
         if "x_des" not in CONTROLS[options.control].inputs:
             starts.pop("x_des", None)
         else:

@@ -13,6 +13,27 @@ Setting = object
 """A number, Boolean or text, or a sequence or array of these; dicts of mixed values have the type dict[str, object]."""
 
 
+ALIKE = 0.75  # ratio of difflib from which on a variable may be meant
+MEANT = {
+    "zeta": "Kd",
+    "damping_ratio": "Kd",
+    "gain": "Kp",
+    "stiffness": "Kp",
+    "rpy_des": "quat_des",
+    "target": "x_des",
+    "goal": "x_des",
+    "tau_max": "limit_effort",
+    "torque": "tau_ext",
+    "force": "f_ext",
+    "mass": "payload",
+    "load": "payload",
+    "dt": "control_period",
+    "delay": "control_delay",
+    "noise": "q_noise",
+}
+"""Names that people use for variables."""
+
+
 class Variables(Protocol):
     """The variables of an FMU or of a build."""
 
@@ -120,6 +141,7 @@ def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
     near = nearest(name, known, 0.85)
     if near is None and "." in name:  # Kp of a system, not controller.Kp
         near = nearest(name.rpartition(".")[2], [each for each in known if "." not in each], 0.6)
-    own = [each for each in (indexed, near) if each in known]
-    like = f"; did you mean '{own[0]}'?" if own else choice(name, known, cutoff=0.4)
+    unitless = re.sub(r"\s+[\[(].*$", "", name)  # Kp [1/s2] of a table
+    own = [each for each in (indexed, near, MEANT.get(name), unitless) if each in known]
+    like = f"; did you mean '{own[0]}'?" if own else choice(name, known, ALIKE)
     return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"

@@ -25,6 +25,7 @@ MAX_LINKS = 1000
 MAX_JOINTS = 128  # moving joints; Pinocchio's memory grows with the cube of their number
 MAX_SHAPES = 5000  # visuals and collisions, all of which a page contains
 MAX_ELEMENTS = 100_000
+DEGREES = 25.0, 1e4  # rad: limits between these are probably in degrees; larger ones mean no limit
 MAX_DEPTH = 100  # nested elements
 MAX_NAME = 1000  # characters; a string literal of C holds 4095 bytes
 LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
@@ -153,6 +154,9 @@ def read_urdf(text: str) -> Urdf:
             "equal or missing lower and upper limits do not allow any motion of"
             f" {_listed('joint', frozen)}: give limits, or type 'continuous'"
         )
+    turns = {n: max(abs(j.low), abs(j.high)) for n, j in joints.items() if not j.prismatic}
+    if wide := [n for n, most in turns.items() if DEGREES[0] < most < DEGREES[1]]:
+        warnings.append(f"limits of more than {DEGREES[0]:g} rad may be in degrees: {_listed('joint', wide)}")
     return Urdf(tree.get("name", ""), root, tuple(links), joints, tree, tuple(warnings))
 
 

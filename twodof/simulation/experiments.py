@@ -75,7 +75,8 @@ class Experiment:
         last = first + (self.steps * self.step * NANOSECONDS if self.steps < inf else 0)
         if not 0 <= first <= last <= LATEST_STAMP:
             whose = "the wall clock" if start is None else f"stamp_start = {start:g} s"
-            raise InputError(f"the stamps of a run from {whose} on are not those of 1970 to 2038")
+            span = f" with a duration of {(last - first) / NANOSECONDS:.6g} s" if last > first else ""
+            raise InputError(f"the stamps of a run from {whose} on{span} are not within 1970 to 2038")
         return first
 
 

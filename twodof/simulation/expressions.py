@@ -66,8 +66,11 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
         value = _compiled(ast.parse(text.strip(), mode="eval").body, names, condition)
     except (ValueError, SyntaxError, OverflowError, RecursionError, MemoryError):
         like = "a comparison, as 'error > 1e-3'" if condition else "a value, as 'settling + 0.1*peak_effort'"
-        units = "; leave units out" if re.search(r"\d\s*(%|(?!e[-+]?\d)[^\W\d])", text) else ""
-        raise InputError(f"'{text:.100}' is not {like}{units}") from None
+        if re.search(r"\b(and|or)\b|,|&", text):
+            remedy = "; give each condition for itself" if condition else ""
+        else:
+            remedy = "; leave units out" if re.search(r"\d\s*(%|(?!e[-+]?\d)[^\W\d])", text) else ""
+        raise InputError(f"'{text:.100}' is not {like}{remedy}") from None
     if not names:
         raise InputError(f"'{text:.100}' has no number of a run; there are: {', '.join(known)}")
     for name in names:

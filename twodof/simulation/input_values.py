@@ -108,6 +108,8 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
     if not elements:
         raise InputError(f"'{path}': {no_variable(fmu, name, 'input')}")
     variables = [fmu.variables[element] for element in elements]
+    if variables[0].causality == "parameter":
+        raise InputError(f"'{path}': {name} is a parameter, which is set before a run and not by a table")
     if any(variable.causality != "input" or variable.type not in KINDS for variable in variables):
         raise InputError(f"'{path}': {name} is not an input of a number or Boolean")
     return elements
