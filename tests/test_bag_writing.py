@@ -16,6 +16,7 @@ from pathlib import Path
 from threading import Timer
 from typing import Any
 
+import numpy as np
 import pytest
 from bags import (
     PERIOD,
@@ -30,14 +31,17 @@ from bags import (
 )
 from harness import python, wait_until
 from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
+from ruamel.yaml import YAML
 from tools import needs
 
 import twodof
 from twodof.bag.storage import BagWriter
 from twodof.errors import BagError, BuildError
 from twodof.files import is_being_written
+from twodof.ros.messages import LATCHED, STREAM, store_of
 from twodof.simulation.experiments import Experiment
 
 MIB = 1024**2
@@ -430,3 +434,37 @@ def test_a_run_killed_twice_before_its_first_sample_leaves_the_old_bag(run, tmp_
     assert len(twodof.read_bag(tmp_path / "bag.replaced").t) == 5
     written(run, path, 3, overwrite=True)
     assert [*tmp_path.iterdir()] == [path] and assert_consistent(path, "mcap") == 3
+
+
+ODD = "a \x85 b\u2028c\n\t\x7f \x1b 'quoted' \"twice\" back\\slash é 😀: - # {x}\r\n"
+
+
+def closed(path: Path) -> str:
+    """Write a bag with several profiles, and texts that are difficult in YAML; return its metadata."""
+    writer = BagWriter(path, "mcap")
+    writer.open()
+    for k, profiles in enumerate(([], [STREAM], [STREAM, LATCHED])):
+        number = writer.add_connection(
+            f"/té{k}", "std_msgs/msg/String", typestore=store_of("std_msgs/msg/String"), offered_qos_profiles=profiles
+        ).id
+    writer.write_all(np.array([5, 7]), {number: np.zeros((2, 9), np.uint8)})
+    for key in ("twodof", "twodof/left arm", "null"):
+        writer.set_custom_data(f"{key}", ODD)
+    writer.close()
+    return (path / "metadata.yaml").read_text("utf-8")
+
+
+def test_metadata_are_those_that_rosbags_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are read by YAML 1.2 and by YAML 1.1, which yaml-cpp and PyYAML have."""
+    own = closed(tmp_path / "own" / "bag")
+    monkeypatch.delattr(BagWriter, "close")
+    theirs = closed(tmp_path / "theirs" / "bag")
+    assert own.isascii() and own != theirs
+    old = YAML(typ="safe", pure=True)
+    old.version = (1, 1)
+    assert YAML(typ="safe").load(own) == YAML(typ="safe").load(theirs) == old.load(own)
+    for name in ("own", "theirs"):
+        with (tmp_path / name / "bag/bag.mcap").open("rb") as file:
+            (record,) = make_reader(file).iter_metadata()
+        stored = YAML(typ="safe").load(record.metadata["serialized_metadata"])
+        assert {"rosbag2_bagfile_information": stored} == YAML(typ="safe").load(own)

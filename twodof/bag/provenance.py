@@ -23,7 +23,7 @@ FILE = "run.json"
 FORMAT = 1
 KEY = "twodof"
 """Key of the provenance in a bag's own metadata."""
-MAX_YAML = 256 * 1024  # bytes of changes in metadata.yaml: a YAML writer takes 2 s per MiB
+MAX_YAML = 256 * 1024  # bytes of changes in metadata.yaml: YAML libraries take seconds per MiB
 KNOWN_UNTIL: Final = "inputs_known_until"
 """Key of the time, s, after which changes of inputs are missing because the file is full."""
 MAX_TAIL = 64 * 1024  # bytes of commanders and verdict; 20 commanders have fewer
