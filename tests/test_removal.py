@@ -377,6 +377,23 @@ def test_joints_that_creep_are_named_apart_from_joints_that_stick(fmus: dict[str
     assert "without friction" in sticks and "without friction" not in creeps  # the same run
 
 
+@pytest.mark.parametrize("steered", [False, True])
+def test_the_error_of_a_step_has_the_cause_that_is_seen_until_then(fmus: dict[str, Path], steered) -> None:
+    unstable: dict[str, Any] = {
+        "control_period": 0.05,
+        "control_delay": 0.1,
+        "Kp": 3e5,
+        "Kd": 2e4,
+        "q_min": -1e9,
+        "q_max": 1e9,
+    }
+    steer: dict[str, Any] = {"steer": lambda: None} if steered else {}
+    cause = r"; until then: Kp = 300000 .* are too high for control_period = 0.05 s and control_delay = 0.1 s: the loop"
+    with pytest.raises(SimulationError, match=cause) as refusal:
+        twodof.simulate(fmus["task"], settings=unstable, **steer)
+    assert (refusal.value.k, refusal.value.outcome) == (27, "discarded")
+
+
 def test_a_request_to_stop_ends_the_repetitions(fmus: dict[str, Path]) -> None:
     summary = twodof.simulate(fmus["task"], settings={"payload": 0.3})
     repeater = summary.repeat

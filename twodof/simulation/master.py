@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,6 +16,7 @@ from ..notebook import in_notebook
 from ..signatures import ignore, never, with_keywords_of
 from .experiments import Experiment, ExperimentOptions, experiment
 from .input_values import Setting
+from .judge import Judge
 from .pace import RealTime
 from .progress import Progress
 from .removal import Repeat
@@ -24,6 +25,7 @@ from .run_summary import Summary
 from .sample import Sample, Sink
 from .setup import robot_of
 from .stepping import Resume, Stop, as_experiment, far_target, judge_of, stepped, stepped_rows
+from .verdict import conclude
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -128,6 +130,8 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
 
         sources = []
         judges = [judge_of(run, robot_of(run.fmu.urdf)) for run, *_ in members]
+        if len(judges) == 1:
+            stack.enter_context(_explaining(*judges))
         for member, judge in zip(members, judges):
             ready = begin if member is members[-1] else lambda: None
             source = stepped(member.run, judge, None, lambda: ended, ready, member.resumed, member.instance)
@@ -161,11 +165,27 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
     return summaries
 
 
+@contextmanager
+def _explaining(judge: Judge) -> Iterator[None]:
+    """Add the first cause that the samples show to the error of a run that a step ended."""
+    try:
+        yield
+    except SimulationError as error:
+        judge.flush()
+        if judge.count < 2:
+            raise
+        causes = [cause for cause in conclude(judge).causes if not cause.noted]
+        if not causes:
+            raise
+        raise SimulationError(f"{error}; until then: {causes[0].text}", error.k, error.outcome) from error
+
+
 def _simulate_rows(member: Member, stop: Stop) -> Summary:
     """Run an FMU whose sinks receive rows of outputs; errors as of ``simulate_together``."""
     run, sinks, *_ = member
     judge, started = judge_of(run, robot_of(run.fmu.urdf)), 0.0
     with ExitStack() as stack:
+        stack.enter_context(_explaining(judge))
         running = stack.enter_context(ExitStack())  # on an error, sinks end before the instance does
         instance = member.instance or running.enter_context(instantiate(run.fmu))
 
