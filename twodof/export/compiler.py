@@ -239,9 +239,11 @@ def remember(file: Path, content: bytes) -> None:
         file.parent.mkdir(mode=0o700, exist_ok=True)
         write_file(file, hashlib.sha256(content).digest() + content)
         file.chmod(0o600)  # independent of the umask, because a file that others may write is not reused
-        for other in file.parent.iterdir():
-            if other.is_file() and other.stat().st_mtime < time.time() - KEPT_FOR:
-                other.unlink()
+        earliest = time.time() - KEPT_FOR
+        with os.scandir(file.parent) as others:
+            for other in others:
+                if other.is_file() and other.stat().st_mtime < earliest:
+                    os.unlink(other)
 
 
 def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
