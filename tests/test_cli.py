@@ -304,6 +304,13 @@ def test_one_value_for_a_vector_says_that_it_was_spread(native_path, tmp_path, c
     assert given["Kp[1]"] == given["Kp[2]"] == 60.0
 
 
+def test_a_column_for_a_vector_says_that_it_was_spread(native_path, tmp_path, caplog):
+    (tmp_path / "x.csv").write_text("time,Kp,x_des[1]\n0,60,0.2\n")
+    options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--input", str(tmp_path / "x.csv")]
+    assert main(["run", str(native_path), *options]) == 0
+    assert [text.partition("': ")[2] for text in caplog.messages] == ["the column 'Kp' sets all 2 elements"]
+
+
 def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_path, tmp_path):
     answer, urdf = tmp_path / "answer", Path(__file__).parents[1] / "urdf/2dof.urdf"
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.02)
@@ -332,7 +339,7 @@ def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_pa
 @pytest.mark.parametrize("verb", EXAMPLES)
 def test_the_examples_of_each_help_are_commands(verb):
     program, verbs = parser()
-    assert EXAMPLES[verb] and {*EXAMPLES} == {"", *verbs} - {"help"}
+    assert len(EXAMPLES[verb]) > 1 and {*EXAMPLES} == {"", *verbs} - {"help"}
     for line in EXAMPLES[verb]:
         name, *arguments = shlex.split(line)
         assert name == "twodof" and arguments[0] == (verb or arguments[0])

@@ -61,6 +61,7 @@ def error(summary: twodof.Summary) -> float:
         ("task", {"q_min": (0.2, -3.0)}, "limit", {"q_min": -1e9, "q_max": 1e9}),
         ("joint", {"q_des": (90.0, 0.35)}, "degrees", {"q_des": (1.5707963267948966, 0.35)}),
         ("joint", {"q_des": (45.0, 30.0)}, "degrees", {"q_des": (0.7853981633974483, 0.5235987755982988)}),
+        ("joint", {"q_des": (45.0, 5.0)}, "degrees", {"q_des": (0.7853981633974483, 0.08726646259971647)}),
         ("joint", {"q_des": (0.9, 0.8), "friction": (0.3, 0.1)}, "friction", {"friction": 0.0}),
         ("joint", {"q_des": (0.9, 0.8), "control_period": 0.06, "Kd": 60.0}, "unstable", {"control_period": 0.0}),
         ("joint", {"q_des": (0.9, 0.8), "damping": 20.0}, "load", {"damping": 0.0}),

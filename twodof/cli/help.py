@@ -27,7 +27,10 @@ EXAMPLES = {
         "twodof publish my_robot.fmu --scene --effort",
         "twodof publish left=my_robot.fmu right=my_robot.fmu --clock -o my_bag",
     ],
-    "layouts": ["twodof layouts my_robot.fmu -o layouts"],
+    "layouts": [
+        "twodof layouts my_robot.fmu -o layouts",
+        "twodof layouts left.fmu --namespace left -o layouts_of_left",
+    ],
     "info": ["twodof info my_robot.fmu", "twodof info my_bag", "twodof info my_sweep --json"],
     "check": ["twodof check my_robot.fmu", "twodof check my_robot.fmu --with libcosim"],
     "linearise": ["twodof linearise TwoDof-native.fmu", "twodof linearise my_robot.fmu --at q=0.5,0.35 --at Kp=100"],
@@ -53,7 +56,7 @@ EXAMPLES = {
         "twodof export my_bag -o my_bag.mcap",
         "twodof export monday tuesday -o my_robot.lerobot",
     ],
-    "recover": ["twodof recover my_bag"],
+    "recover": ["twodof recover my_bag", "twodof recover /media/stick/my_bag"],
 }
 ALIKE = 0.7  # ratio of difflib from which on a verb or option may be meant
 MEANT = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 import sys
 from collections.abc import Sequence
@@ -75,6 +76,7 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
     from ..fmu import load_fmu
     from ..simulation.experiments import experiment
 
+    logging.getLogger("twodof.simulation.input_values").setLevel(logging.INFO)  # columns that set vectors
     fmu, table, changes = load_fmu(chosen_fmu(options), getattr(options, "robot", "")), options.input, None
     settings = _settings(options, fmu)
     if table is not None:

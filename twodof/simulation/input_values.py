@@ -1,6 +1,7 @@
 """Settings of a run: values by name, and CSV files of inputs over time, checked against an FMU."""
 
 import csv
+import logging
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -17,6 +18,8 @@ from ..fmu import resolve_all as resolve_all
 from ..plant.numerals import number, whole_number
 from ..plant.variables import GAINS
 from ..plant.variables import Value as Value
+
+LOG = logging.getLogger(__name__)
 
 Changes = list[tuple[float, dict[str, Value]]]
 """Ascending times, s, and the new values of inputs at these times."""
@@ -60,6 +63,9 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     elements = {name: _inputs(fmu, path, name) for name in header if name != "time"}
     if not elements:
         raise InputError(f"'{path}' has no column beside 'time'; add one for each input")
+    for name, own in elements.items():
+        if len(own) > 1:
+            LOG.info(f"'{path}': the column '{name}' sets all {len(own)} elements")
     columns = [element for name in header for element in elements.get(name, ["time"])]
     twice = next((element for element, n in Counter(columns).items() if n > 1), None)
     if twice is not None:

@@ -14,7 +14,7 @@ from .judge import Judge
 from .setup import OF_THE_CONTROLLER, Array
 
 LONGER = 10.0  # a run is repeated for at most this many times its duration more
-TURN = 6.0  # rad: larger joint targets are in degrees, if one is
+TURN = 6.0  # rad: larger joint targets, and whole numbers, are in degrees, if one is
 STIFFER = 10.0  # factor of Kp of a run that tries the advice to raise it
 USUAL = {name: start for name, *_, start, _ in ROWS if isinstance(start, float)}
 SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
@@ -100,10 +100,10 @@ def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
 
 
 def _in_radians(judge: Judge) -> dict[str, float]:
-    """Return large positions of all joints, read as degrees, in rad."""
+    """Return large and whole positions of all joints, read as degrees, in rad."""
     turning = [i + 1 for i, unit in enumerate(judge.setup.units) if unit == "rad"]
     values = {name: judge.held.get(name, 0.0) for i in turning for name in (f"q_des[{i}]", f"q_start[{i}]")}
-    return {name: radians(value) for name, value in values.items() if abs(value) > TURN}
+    return {name: radians(value) for name, value in values.items() if abs(value) > TURN or value == round(value) != 0}
 
 
 def _raised(judge: Judge) -> dict[str, float]:

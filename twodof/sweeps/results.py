@@ -25,7 +25,7 @@ from .ranking import RANKED, candidates
 from .runner import Row
 from .stored_table import PART, WHOLE, files_of, named, provenance_in, read_tables, schema_of
 
-with needing(SweepError, "store a table", "sweep"):
+with needing(SweepError, "read or write tables of sweeps", "sweep"):
     import pandas
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -19,7 +19,7 @@ from ..files import NUMBER, VALUES, check_file, fits, parsed
 from ..simulation.verdict import METRICS
 from ..version import needing
 
-with needing(SweepError, "store a table", "sweep"):
+with needing(SweepError, "read or write tables of sweeps", "sweep"):
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.parquet as pq
