@@ -330,8 +330,7 @@ def test_no_step_to_any_target_is_refused(gains, length):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("max_step", [0.001, 0.01, 0.05])
-def test_falls_between_narrow_stops_miss_none(max_step, length):
+def test_falls_between_narrow_stops_miss_none(length):
     """The joints of the bare arm are stopped and released at both ends, also within one step."""
     rng, of = np.random.default_rng(7), engine("twodof", "effort")
     stopped = 0
@@ -347,15 +346,16 @@ def test_falls_between_narrow_stops_miss_none(max_step, length):
             rigid_stops=False,
             rtol=1e-8,
             atol=1e-11,
-            max_step=max_step,
         )
-        oracle, values = Oracle(plant), of.values(plant)
-        for _ in range(8):
-            assert of.call("advance", values, 0.05) == 1
-        expected = oracle.after(0.4)
-        found = np.array([*of.group(values, "q"), *of.group(values, "v")])
+        expected = Oracle(plant).after(0.4)
         stopped += (expected[2:] == 0.0).any()
-        np.testing.assert_allclose(found, expected, atol=1e-5)
+        for max_step in (0.001, 0.01, 0.05):
+            plant.max_step = max_step
+            values = of.values(plant)
+            for _ in range(8):
+                assert of.call("advance", values, 0.05) == 1
+            found = np.array([*of.group(values, "q"), *of.group(values, "v")])
+            np.testing.assert_allclose(found, expected, atol=1e-5)
     assert stopped >= length(100, 8)
 
 
