@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from friction_oracle import Rubbing
-from native_models import Engine, Model, Reduced, engine, from_urdf, model, urdf_path
+from native_models import Engine, Model, Reduced, engine, from_urdf, model, robots_folder, urdf_path
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 SLIDER = """<robot name="slider"><link name="base"/><link name="body"><inertial><mass value="2"/>
@@ -315,3 +316,25 @@ def test_a_clamped_joint_without_a_range_moves_others_as_one_with_the_smallest_r
         plant.prepare()
         ends.append([q[0] for q, _ in states(native, plant, 0.01, 60, python=python)])
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
+def test_stock_robots_with_friction_run_in_both_flavours(length):
+    """They build without a warning of friction, and all move 0.05 m away against it for a second."""
+    rough = [
+        str(path.relative_to(robots_folder()))
+        for path in sorted(robots_folder().rglob("*.urdf"))
+        if re.search(r'friction="0*\.?0*[1-9]', path.read_text("utf-8", "ignore"))
+    ]
+    assert len(rough) >= 18
+    moved = set()
+    for name in rough[:: length(1, 4)]:
+        of, ends = model(name), []
+        assert any(of.robot.friction) and not any("friction" in warning for warning in of.robot.warnings)
+        for python in (True, False):
+            plant = of.plant()
+            plant.x_des = [x + 0.05 for x in plant.x]
+            *_, end = states(engine(name), plant, 0.01, 100, python=python)
+            ends.append(np.concatenate(end))
+        np.testing.assert_allclose(ends[0], ends[1], rtol=1e-9, atol=1e-9)
+        moved |= {name} if np.abs(ends[0] - np.concatenate([plant.q_start, plant.v_start])).max() > 1e-3 else set()
+    assert len(moved) > len(rough[:: length(1, 4)]) // 2
