@@ -98,7 +98,7 @@ class Worker:
     def __call__(self, function, *arguments):
         self._pipe.send((function, arguments))
         try:
-            if self._pipe.poll(60.0):
+            if self._pipe.poll(600.0):
                 return self._pipe.recv()
             failure = "hangs"
         except EOFError:

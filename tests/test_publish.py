@@ -310,7 +310,7 @@ participant = DomainParticipant(number)
 name = "sensor_msgs/msg/JointState"
 topic = Topic(participant, "rt/joint_states", dds_type(name))
 reader = DataReader(participant, topic, dds_qos(STREAM, name))
-end, heard = time.monotonic() + 20.0, 0
+end, heard = time.monotonic() + 120.0, 0
 while heard < 50 and time.monotonic() < end:
     heard += len(reader.take(10))
     time.sleep(0.01)

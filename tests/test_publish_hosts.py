@@ -106,7 +106,7 @@ def test_other_hosts_are_obeyed_only_with_permission(native_path, tmp_path, numb
     with published(number, native_path, *options, inside=inside, **variables) as process, other_host(process) as host:
         assert said in process.told[1]
         command = [*ENTER, str(host), sys.executable, "-c", FOREIGN, str(number), "10.200.0.1"]
-        seconds = "60" if open_to else "6"
+        seconds = "120" if open_to else "6"
         heard = subprocess.run([*command, seconds], stdout=subprocess.PIPE, check=True).stdout
         process.send_signal(signal.SIGINT)
         ended(process, 130)
