@@ -437,6 +437,10 @@ REFUSED: dict = {
         {"control_period": 0.001, "control_delay": 0.0101},
         "control_delay = 0.0101 must be at most 10 times control_period = 0.001; lessen it",
     ),
+    ("joint", "slightly too long"): (
+        {"control_period": 0.01, "control_delay": 0.1000000001},
+        "control_delay = 0.1000000001 must be at most 10 times control_period = 0.01; lessen it",
+    ),
     ("joint", "q_noise"): ({"q_noise": 0.1}, "q_noise[1] = 0.1 needs a control_period > 0; set that"),
     ("joint", "v_noise"): ({"v_noise": 0.1}, "v_noise[1] = 0.1 needs a control_period > 0; set that"),
     ("joint", "q_resolution"): ({"q_resolution": 0.1}, "q_resolution[1] = 0.1 needs a control_period > 0"),

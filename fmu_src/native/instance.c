@@ -81,8 +81,8 @@ static Status check_sampling(Instance *instance)
         return report(instance, ERROR, "control_delay = %g needs a control_period > 0; set that, or leave"
                       " it out", delay);
     if (delay > MOST_PERIODS * period * (1.0 + 1e-12)) /* 0.11 is more than ten times 0.011 in binary numbers */
-        return report(instance, ERROR, "control_delay = %g must be at most %d times control_period = %g; lessen it,"
-                      " or enlarge control_period", delay, MOST_PERIODS, period);
+        return report(instance, ERROR, "control_delay = %.12g must be at most %d times control_period = %.12g;"
+                      " lessen it, or enlarge control_period", delay, MOST_PERIODS, period);
     for (int i = N_JOINTS; i-- > 0 && value[V_FROM_Q] != 0.0;)
         if (value[V_NOISE + i] != 0.0)
             return report(instance, ERROR, "%s = %g has no effect with v_from_q = true; leave one of them out",
