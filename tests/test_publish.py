@@ -333,6 +333,8 @@ def test_cyclone_dds_as_jazzy_configures_it_hears(native_path, number, variables
         command = [*enter, sys.executable, "-c", LISTENER, str(number)]
         shells = [subprocess.Popen([*command, it], stdout=subprocess.PIPE) for it in SHELLS]
         assert min(int(shell.communicate()[0]) for shell in shells) >= 50
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
 
 
 def test_an_interface_can_be_chosen(native_path, number):
