@@ -188,6 +188,41 @@ def test_a_click_in_the_map_opens_the_runs_curves(native_path, tmp_path):
             assert shown.evaluate("document.documentElement.scrollWidth") == width
 
 
+CHARTS = """() => sweepPage.charts.map(({kind, shown, div}) => {
+    const data = div.data.map(({x, y, mode}) => ({x: [...x], y: [...y], lines: mode.includes("lines")}));
+    return {kind, shown, data, box: div.getBoundingClientRect().toJSON()};
+})"""
+
+
+def test_two_maps_stand_side_by_side_with_crosses_and_a_pareto_front(native_path, tmp_path):
+    folder = tmp_path / "s"
+    sweep(native_path, grid={"Kp": [20, 60, 200, 600, 2000], "Kd": [10, 20, 40, 80]}, stop_time=3, output=folder)
+    table = table_of(folder)
+    page = save(drawing(read_sweep(folder), "a"), tmp_path / "a.html")
+    with browser.chromium() as chromium, chromium.new_context(offline=True) as context:
+        shown = context.new_page()
+        shown.set_viewport_size({"width": 1200, "height": 900})
+        shown.goto(page.as_uri())
+        shown.wait_for_selector("#maps[data-ready]")
+        left, right, front = shown.evaluate(CHARTS)
+    assert [chart["kind"] for chart in (left, right, front)] == ["map", "map", "front"]
+    assert left["box"]["top"] == right["box"]["top"] and left["box"]["right"] <= right["box"]["left"]
+    impossible = (table.effort_use > 1.0) | (table.velocity_use > 1.0)
+    marked = table[impossible]
+    assert 0 < len(marked) < len(table)
+    for chart in (left, right):
+        x, y, _ = chart["shown"]
+        _, crosses, _ = chart["data"]
+        assert sorted(zip(crosses["x"], crosses["y"])) == sorted(zip(marked[x], marked[y]))
+    x, y = front["shown"]
+    possible = table[~impossible & table[x].notna() & table[y].notna()]
+    points = [*zip(possible[x], possible[y])]
+    best = {p for p in points if not any(a <= p[0] and b <= p[1] and (a, b) != p for a, b in points)}
+    (line,) = (trace for trace in front["data"] if trace["lines"])
+    assert len(best) > 2
+    np.testing.assert_allclose([*zip(line["x"], line["y"])], sorted(best), rtol=1e-8)  # a page has nine digits
+
+
 def test_a_page_has_a_limited_number_of_values(grid_sweep, monkeypatch):
     table, pages = read_sweep(grid_sweep), list[dict[str, Any]]()
     monkeypatch.setattr(maps, "figures_html", lambda content, _: pages.append(content))
