@@ -6,6 +6,7 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError, path_of
@@ -66,10 +67,10 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
         replaced = overwrite or not path.is_file() or descriptor_of(path) is not None or is_default_arm(path)
         if not replaced and not _fits(path, lambda zipped: _holds(zipped, *built)):
             raise _other(path, f"is {'another' if is_fmu(path) else 'not an'} FMU")
-        members = {**files, **finish()}
-        if not replaced and not _fits(path, lambda zipped: _contents(zipped) == members):
+        content = _zipped(files, comment, finish)
+        built_now = zipfile.ZipFile(io.BytesIO(content))
+        if not replaced and not _fits(path, lambda zipped: _contents(zipped) == _contents(built_now)):
             raise _other(path, "has the description of this FMU and other contents: it was changed, or others built it")
-        content = _zipped(members, comment)
         with refusing(BuildError, f"write '{path}'"):
             if not _has(path, content):
                 write_file(path, content)
@@ -176,14 +177,29 @@ def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str
     return same and refers == reference and built_for == set(platforms)
 
 
-def _zipped(files: Mapping[str, bytes], comment: bytes = b"") -> bytes:
-    """Return a zip archive of sorted entries with fixed dates, so that equal inputs give equal bytes."""
+def _zipped(
+    files: Mapping[str, bytes], comment: bytes = b"", finish: Callable[[], Mapping[str, bytes]] = dict
+) -> bytes:
+    """Return a zip archive of files and of those that ``finish`` returns, which may replace others but resources.
+
+    Resources are compressed while ``finish`` runs, and therefore come first in the archive. Its directory is sorted.
+    Entries have a fixed date, so that equal inputs give equal bytes.
+    """
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+    with ThreadPoolExecutor(1) as pool, zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.comment = comment
-        for name in sorted(files):
-            entry = zipfile.ZipInfo(name, ZIP_DATE)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, files[name])
+        finished = pool.submit(finish)
+        resources = {name: files[name] for name in files if name.startswith("resources/")}
+        _add(archive, resources)
+        others = {**files, **finished.result()}
+        _add(archive, {name: others[name] for name in others.keys() - resources})
+        archive.filelist.sort(key=lambda entry: entry.filename)
     return content.getvalue()
+
+
+def _add(archive: zipfile.ZipFile, files: Mapping[str, bytes]) -> None:
+    for name in sorted(files):
+        entry = zipfile.ZipInfo(name, ZIP_DATE)
+        entry.compress_type = zipfile.ZIP_DEFLATED
+        entry.external_attr = 0o644 << 16
+        archive.writestr(entry, files[name])
