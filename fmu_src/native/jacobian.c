@@ -37,6 +37,28 @@ static void add_products(Matrix M, double b[X][N_JOINTS], int first, int end, do
     }
 }
 
+/* Compute the motions of all joints, from the root outwards. Gravity is an upward acceleration of the root. */
+static void joint_motions(const JointPosition joint[N_BODIES], const double v[N_JOINTS], const double a[N_JOINTS],
+                          const double gravity[3], JointMotion motion[N_BODIES])
+{
+    const JointMotion root = {.acceleration = {0.0, 0.0, 0.0, -gravity[0], -gravity[1], -gravity[2]},
+                              .R = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}}};
+    double x[3];
+    for (int i = 0; i < N_BODIES; i++) {
+        const double turned[3] = {joint[i].c, joint[i].s, 0.0}, slid[3] = {1.0, 0.0, joint[i].c};
+        const JointMotion *before = PARENT[i] < 0 ? &root : &motion[PARENT[i]];
+        joint_frame(&FRAME[i], FRAME[i].ratio[1] == 0.0 ? turned : slid, before, &motion[i]);
+    }
+    for (int k = 0; k < 3; k++)
+        x[k] = motion[END_BODY].origin[k] + dot_of(motion[END_BODY].R[k], END_P, 3);
+    for (int i = 0; i < N_BODIES; i++) {
+        const double rate[2] = {v[LEADER[i]], a[LEADER[i]]};
+        for (int k = 0; k < 3; k++)
+            motion[i].origin[k] -= x[k];
+        joint_motion(&FRAME[i], rate, PARENT[i] < 0 ? &root : &motion[PARENT[i]], &motion[i]);
+    }
+}
+
 /* Compute the terms of all joints, from the last one inwards. */
 static void joint_forces(JointTerms *terms, const EndBody *end_body, const JointMotion motion[N_BODIES],
                          JointForce force[N_BODIES])

@@ -92,6 +92,12 @@ typedef struct {
     double s[6], psi[6], chi[6], velocity[6], acceleration[6], R[3][3], origin[3];
 } JointMotion;
 
+/* Constants of a joint: its frame at 0 in that of the body before it, and the ratios of its rotation and of its
+   translation to the joint that it follows. */
+typedef struct {
+    double R[3][3], p[3], ratio[2];
+} JointFrame;
+
 /* Of all bodies that a joint moves: the angular part of Bᵀ s, whose linear part is 0, I s, and with the motion x of a
    joint before it, derivatives of their effort on that joint: by q, by_q·x, and by v, by_v·x. */
 typedef struct {
@@ -104,8 +110,13 @@ typedef struct {
 } Load;
 
 #ifndef IS_COMPLEX
-INTERNAL void joint_motions(const JointPosition joint[N_BODIES], const double v[N_JOINTS], const double a[N_JOINTS],
-                            const double gravity[3], JointMotion motion[N_BODIES]);
+/* Set a joint's axes and origin in the root's axes, by its cosine, sine and displacement. */
+INTERNAL void joint_frame(const JointFrame *frame, const double position[3], const JointMotion *before,
+                          JointMotion *motion);
+
+/* Set the rest of a joint's motion by its velocity and acceleration. */
+INTERNAL void joint_motion(const JointFrame *frame, const double rate[2], const JointMotion *before,
+                           JointMotion *motion);
 
 /* Compute a joint's terms and load by its body and the load beyond it; the second one for motions at rest. */
 typedef void JointTerms(const EndBody *body, const JointMotion *motion, const Load *beyond, Load *load,

@@ -17,8 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .bodies import Array, Body, JointTree, cross
-from .recursions import placements
+from .bodies import Array, Body, Frame, JointTree, Scalar, cross
 
 
 def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: Array) -> list[Array]:
@@ -26,28 +25,52 @@ def joint_motions(robot: JointTree, joint: Array, v: Array, a: Array, gravity: A
 
     Gravity is an upward acceleration of the root.
     """
-    local, offsets = placements(robot, joint)
     follows = (robot.G != 0.0).astype(float)
-    rates, accelerations, ratios = follows.dot(v), follows.dot(a), robot.G.sum(axis=1)
-    rotations: list[Array] = []
-    origins: list[Array] = []
-    for R, p, parent in zip(local, offsets, robot.parent):
-        before = rotations[parent] if parent >= 0 else np.eye(3)
-        rotations.append(before.dot(R))
-        origins.append((origins[parent] if parent >= 0 else np.zeros(3)) + before.dot(p))
-    end = robot.path[-1]
-    x = origins[end] + rotations[end].dot(robot.frame_p)
-    motions: list[tuple[Array, ...]] = []
-    root = np.array([0.0, 0.0, 0.0, *-gravity])
-    for i, parent in enumerate(robot.parent):
-        origins[i] = origins[i] - x
-        z, zero = rotations[i][:, 2] * ratios[i], np.zeros(3)
-        s = np.array([*zero, *z] if robot.prismatic[i] else [*z, *cross(origins[i], z)])
-        velocity, acceleration = motions[parent][3:] if parent >= 0 else (np.zeros(6), root)
-        psi = _motion_cross(velocity, s)
-        chi = _motion_cross(acceleration, s) + _motion_cross(velocity, psi)
-        motions.append((s, psi, chi, velocity + s * rates[i], acceleration + psi * rates[i] + s * accelerations[i]))
-    return [*map(np.array, zip(*motions)), np.array(rotations), np.array(origins)]
+    rates = zip(follows.dot(v), follows.dot(a))
+    frames: list[Frame] = []
+    for own, position, parent in zip(zip(robot.R, robot.p), joint_positions(robot, joint), robot.parent):
+        frames.append(joint_frame(own, position, frames[parent] if parent >= 0 else ROOT))
+    R, origin = frames[robot.path[-1]]
+    x = origin + R.dot(robot.frame_p)
+    frames = [(R, origin - x) for R, origin in frames]
+    motions: list[list[Array]] = []
+    root = [np.zeros(6), np.array([0.0, 0.0, 0.0, *-gravity])]
+    for frame, ratio, rate, parent in zip(frames, joint_ratios(robot), rates, robot.parent):
+        motions.append(joint_motion(frame, ratio, rate, motions[parent][3:] if parent >= 0 else root))
+    return [*map(np.array, zip(*motions)), *map(np.array, zip(*frames))]
+
+
+ROOT: Frame = np.eye(3), np.zeros(3)
+
+
+def joint_positions(robot: JointTree, joint: Array) -> Array:
+    """Return cosine, sine and displacement of each joint, N × 3."""
+    return np.array([(1.0, 0.0, c) if slides else (c, s, 0.0) for (c, s), slides in zip(joint, robot.prismatic)])
+
+
+def joint_ratios(robot: JointTree) -> Array:
+    """Return the ratios of rotation and translation of each joint to the independent joint that it follows, N × 2."""
+    slides = np.array(robot.prismatic)
+    ratios: Array = np.array([~slides, slides]).T * robot.G.sum(axis=1)[:, np.newaxis]
+    return ratios
+
+
+def joint_frame(constant: Frame, position: Array, before: Frame) -> Frame:
+    """Return a joint's frame in the root's axes; ``constant`` is its frame at 0 in the frame before it."""
+    (x, y, z), p, (c, s, displacement) = constant[0].T, constant[1], position
+    R, origin = before
+    return R.dot(np.array([x * c + y * s, y * c - x * s, z]).T), origin + R.dot(p + z * displacement)
+
+
+def joint_motion(frame: Frame, ratio: Array, rate: Sequence[Scalar], before: Sequence[Array]) -> list[Array]:
+    """Return s, ψ, χ, velocity and acceleration of a joint by its rates, after the motion before it."""
+    (R, origin), (velocity, acceleration) = frame, before
+    z = R[:, 2]
+    angular = z * ratio[0]
+    s = np.array([*angular, *(cross(origin, angular) + z * ratio[1])])
+    psi = _motion_cross(velocity, s)
+    chi = _motion_cross(acceleration, s) + _motion_cross(velocity, psi)
+    return [s, psi, chi, velocity + s * rate[0], acceleration + psi * rate[0] + s * rate[1]]
 
 
 Load = tuple[Body, Array, Array, Array]

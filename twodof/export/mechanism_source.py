@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import chain
 
 import numpy as np
 
 from ..plant.robot import Robot
 from ..plant.variables import OF_LINKS, Variable
 from .bodies import Array, Body, FreeLink, JointTree, joint_tree
-from .derivatives import joint_force, joint_motions
+from .derivatives import ROOT, joint_force, joint_frame, joint_motion, joint_motions, joint_positions, joint_ratios
 from .recursions import (
     effort_bounds,
     hybrid_by_factors,
@@ -68,9 +67,11 @@ def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[Fr
     motions = joint_motions(constants, joint, v, a, gravity)
     s, psi, chi, velocity, *others = motions
     at_rest = [s, np.zeros(psi.shape), chi, np.zeros(velocity.shape), *others]
-    fields = [f"motion[{i}].{field}" for field in MOTION for i in range(len(bodies))]
     derived = {
-        f"joint_motions({in_all}, {moved}, JointMotion motion[N_BODIES])": _named(fields, [*chain(*motions)]),
+        f"joint_frame(const JointFrame *frame, const double position[3], {MOTIONS})": (
+            _joint_frame(constants, joint, motions)
+        ),
+        f"joint_motion(const JointFrame *frame, const double rate[2], {MOTIONS})": _joint_motion(constants, motions),
         f"joint_force({ONE_JOINT})": _joint_force(bodies, motions),
         f"joint_force_at_rest({ONE_JOINT})": _joint_force(bodies, at_rest),
         f"mass_matrix({in_all}, {INERTIAS}, double M[N_JOINTS][N_JOINTS])": _elements(
@@ -88,13 +89,47 @@ def _tree(robot: JointTree, axes: Sequence[int]) -> str:
     parts = [[", ".join(map(_constant, part.flat)) for part in _parts(body)] for body in robot.body]
     constants = ", ".join(f"{{{mass}, {{{moment}}}, {{{inertia}}}}}" for mass, moment, inertia in parts)
     lines.append(f"static const EndBody BODY[N_BODIES] = {{{constants}}};")
+    frames = [*zip(robot.R.tolist(), robot.p.tolist(), joint_ratios(robot).tolist())]
+    lines.append(f"static const JointFrame FRAME[N_BODIES] = {_braces(frames)};")
+    lines.append(f"static const double END_P[3] = {_braces(robot.frame_p.tolist())};")
     lines.append(f"static const int AXIS[N_AXES] = {{{', '.join(map(str, axes))}}};")
     return "\n".join([*lines, f"enum {{ END_BODY = {robot.path[-1]} }};"])
+
+
+def _braces(values: object) -> str:
+    """Return nested sequences of numbers in C."""
+    return f"{{{', '.join(map(_braces, values))}}}" if isinstance(values, (list, tuple)) else repr(values)
 
 
 def _constant(value: Value) -> str:
     """Return a constant in C; the values of a body that varies are not read."""
     return "0.0" if isinstance(value, Expression) else repr(float(value))
+
+
+def _joint_frame(robot: JointTree, joint: Array, motions: Sequence[Array]) -> dict[str, Value]:
+    """Return the frame of any joint by its names in C; constants that all joints have are folded."""
+    constant = _common("frame->R", [*robot.R]), _common("frame->p", [*robot.p])
+    position = _common("position", [*joint_positions(robot, joint)])
+    before = _common("before->R", _before(robot, motions[-2], ROOT[0])), _variables("before->origin", 3)
+    return _named(["motion->R", "motion->origin"], joint_frame(constant, position, before))
+
+
+def _joint_motion(robot: JointTree, motions: Sequence[Array]) -> dict[str, Value]:
+    """Return the motion of any joint by its names in C; constants that all joints have are folded."""
+    frame = _common("motion->R", [*motions[-2]]), _common("motion->origin", [*motions[-1]])
+    ratio = _common("frame->ratio", [*joint_ratios(robot)])
+    roots = np.zeros(6), np.array([0.0, 0.0, 0.0, *_variables("gravity", 3)])
+    before = [
+        _common(f"before->{field}", _before(robot, rows, root))
+        for field, rows, root in zip(("velocity", "acceleration"), motions[3:5], roots)
+    ]
+    motion = joint_motion(frame, ratio, [*_variables("rate", 2)], before)
+    return _named([f"motion->{field}" for field in MOTION], motion)
+
+
+def _before(robot: JointTree, rows: Array, root: Array) -> list[Array]:
+    """Return the row before each joint, from those of the joints and the root."""
+    return [rows[parent] if parent >= 0 else root for parent in robot.parent]
 
 
 def _joint_force(bodies: Sequence[Body], motions: Sequence[Array]) -> dict[str, Value]:
@@ -158,6 +193,7 @@ MECHANISM = """\
 INERTIAS = "const EndBody *end_body, const double armature[N_JOINTS]"
 LOAD_END_BODY = "load_end_body(double payload, const double offset[3]"
 LOAD_BODIES = "load_bodies(double payload, const double offset[3], const double link[N_LINK_VALUES]"
+MOTIONS = "const JointMotion *before, JointMotion *motion"
 ONE_JOINT = "const EndBody *body, const JointMotion *motion, const Load *beyond, Load *load, JointForce *force"
 END_BODY = ("end_body->", "payload", "offset[")
 OF_PARAMETER = {
