@@ -1,6 +1,7 @@
 /* Directional and adjoint derivatives. The first direction at a point costs one complex evaluation. The second
    direction at the same point computes the Jacobian of the accelerations; each further direction is a product with it.
    If the previous point had several directions, the first direction already computes the Jacobian. */
+#include <float.h>
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
@@ -110,13 +111,21 @@ static int is_within(Reference vr, int first, int end, size_t n_values)
     return (FMI == 2 || vr - 1 < N_REFERENCES) && begin_of(vr) >= first && begin_of(vr) < end && size_of(vr) <= n_values;
 }
 
+static int all_finite(const double rate[N_STATES])
+{
+    int finite = 1;
+    for (int i = 0; i < N_STATES; i++)
+        finite &= fabs(rate[i]) <= DBL_MAX; /* without branches, which would take longer than the product */
+    return finite;
+}
+
 /* Compute the derivatives of rates, if they are products with a known Jacobian. Return 0 if the request needs anything
-   else, or if a result is not finite. */
+   else, or if a derivative of the rates is not finite. */
 static int multiply(Instance *instance, const Request *request, const double seed[], size_t n_seed,
                     double result[], size_t n_result)
 {
     const Reference *unknown = request->unknown, *given = request->given;
-    double rate[N_STATES] = {0}, zero = 0.0; /* NaN after a value that is not finite */
+    double rate[N_STATES] = {0};
     if (!(instance->state.has_rates & SLOPES) || !unknown || !given || !seed || !result)
         return 0;
     for (size_t i = 0; i < request->n_given; n_seed -= size_of(given[i++])) {
@@ -129,10 +138,10 @@ static int multiply(Instance *instance, const Request *request, const double see
         if (!is_within(unknown[i], DER_Q, END_OF_RATES, n_result))
             return 0;
         for (int k = begin_of(unknown[i]); k < end_of(unknown[i]); k++)
-            zero += 0.0 * (*result++ = rate[k - DER_Q]);
+            *result++ = rate[k - DER_Q];
     }
     instance->asks_several = 1;
-    return zero == 0.0 && n_seed == 0 && n_result == 0;
+    return all_finite(rate) && n_seed == 0 && n_result == 0;
 }
 
 /* Check a request and its seed, and update the state. Return 0 if a variable has no derivative or the seed is not

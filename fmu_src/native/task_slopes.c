@@ -142,11 +142,11 @@ static int add_command_by_states(const double value[N_VARIABLES], const JointPos
         add_rows(value, error, &motion[i], velocity, acceleration, i, &slopes);
     add_turned(motion, y, slopes.turned);
     for (int r = 0; r < N_ROWS; r++)
-        for (int c = 0; c < N_JOINTS; c++)
-            for (int k = 0; k < N_JOINTS; k++) {
+        for (int k = 0; k < N_JOINTS; k++) {
+            for (int c = 0; c < N_JOINTS; c++)
                 slopes.by_q[r][c] -= task.J[r][k] * slopes.turned[k][c];
-                slopes.by_v[r][c] += k == c ? Kn * task.J[r][k] : 0.0;
-            }
+            slopes.by_v[r][k] += Kn * task.J[r][k];
+        }
     for (int i = 0; i < N_JOINTS; i++) {
         slope[KN][i] -= value[V + i];
         for (int r = 0; r < N_ROWS; r++)
