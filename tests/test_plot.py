@@ -214,6 +214,25 @@ def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path):
     assert any(label in a["text"] for a in over["layout"]["annotations"])
 
 
+@pytest.mark.parametrize(
+    ("settings", "label", "title"),
+    [
+        ({"q_min": (0.2, -3.0)}, "at its limit", "Position in rad"),
+        ({"limit_effort": True, "payload": 10.0, "payload_known": True}, "saturated", "Effort in N·m"),
+    ],
+)
+def test_the_first_sample_at_a_limit_is_marked(native_path, tmp_path, settings, label, title):
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag", effort=True), settings=settings, stop_time=3.0)
+    recording = twodof.read_bag(tmp_path / "bag")
+    signal, reached = recording.q[:, 0], recording.q[:, 0] <= 0.2
+    if label == "saturated":
+        signal, reached = recording.tau[:, 0], np.abs(recording.tau[:, 0]) >= 10.0 * (1.0 - 1e-12)
+    first = int(reached.argmax())
+    (panel,) = (axes for axes in plot(tmp_path / "bag").axes if axes.get_title("left") == title)
+    np.testing.assert_array_equal(only(panel, label), [[recording.t[first], signal[first]]])
+    assert 0 < first < 300
+
+
 def test_measured_velocities_mark_no_stretches_in_which_friction_holds_a_joint(tmp_path):
     """A coarse encoder shows a velocity of 0 while the joint moves."""
     fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
