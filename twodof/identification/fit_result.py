@@ -32,8 +32,6 @@ ERRORS = {
     "gain": "efforts of joint '{joint}' that need about {percent:+.3g} % (free '{name}')",
     "clock": "speeds that need about {percent:+.2g} %, as of a wrong clock",
 }
-UNEVEN = 0.05
-"""Unevenness of the stamps from which on a fit is doubtful: at 0.16, a third of the armatures left their intervals."""
 ALIKE = 100.0
 """Ratio of the probabilities of two errors, below which the data do not tell one from the other."""
 MOST_COMBINATIONS = 5
@@ -84,7 +82,6 @@ class Fit:
         covariance: covariance of the parameters, in their order.
         converged: False if the solution still moved when its steps ended.
         jumps: time of the largest jump, s, by joints whose effort jumps between samples.
-        uneven: RMS difference between the steps of the stamps and their median, relative to it.
         curves: efforts and positions as measured, and as the model gives them.
     """
 
@@ -105,14 +102,12 @@ class Fit:
     covariance: NDArray[np.float64]
     converged: bool
     jumps: Mapping[str, float]
-    uneven: float
     curves: tuple[Curve, ...]
 
     @property
     def explains(self) -> bool:
-        """True if the residuals are noise, the stamps are even, and the efforts do not jump between samples."""
-        sound = not self.jumps and not self.suspects and self.uneven <= UNEVEN
-        return sound and not any(misfit.bad for misfit in self.misfits)
+        """True if the residuals are noise, and the efforts do not jump between samples."""
+        return not self.jumps and not self.suspects and not any(misfit.bad for misfit in self.misfits)
 
     @property
     def rows(self) -> list[tuple[str, str, str, str, str]]:
@@ -152,11 +147,6 @@ class Fit:
             lines.append(
                 f"the effort of joint '{joint}' jumps between samples, most at {t:.4g} s: its course there is"
                 " unknown, and the intervals are too narrow; record at a higher rate, or a smoother motion"
-            )
-        if self.uneven > UNEVEN:
-            lines.append(
-                f"the stamps are uneven, by {100.0 * self.uneven:.2g} % of a step: values between samples are"
-                " interpolated, and the intervals are too narrow, those of armatures most; record at an even rate"
             )
         if not lines:
             lines.append("the model explains these data: its residuals are noise")
@@ -224,7 +214,6 @@ class Fit:
             "explains": self.explains,
             "converged": self.converged,
             "jumps": dict(self.jumps),
-            "uneven": self.uneven,
             "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
             "suspects": [suspect._asdict() for suspect in self.suspects],
             "noise": dict(zip(self.joints, self.noise)),

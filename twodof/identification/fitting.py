@@ -25,7 +25,7 @@ from .fit_result import Fit, FittedParameter, check_folder
 from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
 from .regression import regressors
-from .stretches import Array, Stretch, jumps, stretches, unevenness
+from .stretches import Array, Stretch, jumps, stretches
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -223,7 +223,6 @@ def _result(
         covariance=found.covariance,
         converged=found.converged,
         jumps=jumps(recordings, robot),
-        uneven=unevenness(recordings),
         curves=compared.curves,
     )
 

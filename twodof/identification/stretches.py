@@ -183,19 +183,6 @@ def jumps(recordings: Sequence[Recording], robot: Robot) -> dict[str, float]:
     return {joint: t for joint, (_, t) in found.items()}
 
 
-def unevenness(recordings: Sequence[Recording]) -> float:
-    """Return the largest RMS difference between the steps of a recording and their median, relative to it.
-
-    Steps of more than one and a half medians are gaps.
-    """
-    found = []
-    for recording in recordings:
-        steps = np.diff(recording.t)
-        relative = steps / np.median(steps) - 1.0
-        found.append(float(np.sqrt(np.mean(relative[relative < 0.5] ** 2))))
-    return max(found)
-
-
 def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
     """Return positions and efforts in the robot's order of joints."""
     name, own = recording.path, recording.joints
@@ -224,7 +211,6 @@ def _smooth(bag: int, t: Array, q: Array, tau: Array, h: float) -> Stretch:
     grid = t[0] + h * np.arange(int((t[-1] - t[0]) / h + 1e-6) + 1)
     even = np.abs(np.diff(t) / h - 1.0).max() < 1e-3
     measured = q[: len(grid)] if even else make_interp_spline(t, q, 3)(grid)
-    tau = tau[: len(grid)] if even else np.array([np.interp(grid, t, column) for column in tau.T]).T
     cutoff = CUTOFF * min(BAND / h, MOST_BAND)
     # a straight line between the ends is subtracted, so that drift is not filtered
     line = np.linspace(measured[0], measured[-1], len(grid))
@@ -236,7 +222,10 @@ def _smooth(bag: int, t: Array, q: Array, tau: Array, h: float) -> Stretch:
     nyquist = 0.5 / h
     noise = np.std(measured - smooth, axis=0) / np.sqrt(1.0 - cutoff / nyquist)
     v_noise = noise * 2.0 * np.pi * np.sqrt(cutoff**3 / 3.0 / nyquist)
-    moving = np.abs(v) > np.maximum(MOVES * v_noise, LEAST_SPEED * np.abs(v).max(axis=0))
+    least = MOVES * v_noise
+    moving = np.abs(v) > np.maximum(least, LEAST_SPEED * np.abs(v).max(axis=0))
+    way = np.where(np.abs(spline(t, 1)) > least, np.sign(spline(t, 1)), 0.0)
+    tau = tau[: len(grid)] if even else _resampled(t, tau, way, grid, np.sign(v))
     # acceleration noise below a frequency grows with the fifth power of the frequency
     a_noise = noise * (2.0 * np.pi) ** 2 * np.sqrt(cutoff**5 / 5.0 / nyquist)
     power = np.maximum(np.var(a, axis=0) - a_noise**2, 1e-12)
@@ -246,6 +235,36 @@ def _smooth(bag: int, t: Array, q: Array, tau: Array, h: float) -> Stretch:
     reach = int(np.ceil(1.0 / cutoff / h))
     whole = Stretch(bag, grid, measured, smooth, v, a, tau, _eroded(moving, reach), band)
     return whole.part(slice(edge, len(grid) - edge))
+
+
+def _resampled(t: Array, tau: Array, way: Array, grid: Array, own: Array) -> Array:
+    """Return efforts at times of a grid: parabolas through the three nearest samples in the same direction of motion.
+
+    Friction jumps where a joint reverses. Interpolation across the jump gives wrong armatures.
+
+    Args:
+        t: times of the samples, N.
+        tau: efforts, N × n.
+        way: direction of motion at the samples, −1 or 1, or 0 where it is uncertain, N × n.
+        grid: times between the first and the last sample, K.
+        own: direction of motion at these times, K × n.
+    """
+    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    late = t[after] - grid < grid - t[after - 1]
+    nearest, other = after - ~late, after - late
+    out = np.empty((len(grid), tau.shape[1]))
+    for i, effort in enumerate(tau.T):
+        home = np.where((way[nearest, i] != own[:, i]) & (way[other, i] == own[:, i]), other, nearest)
+        cuts = np.flatnonzero(np.diff(way[:, i])) + 1
+        run = np.searchsorted(cuts, home, side="right")
+        first, last = np.append(0, cuts)[run], np.append(cuts, len(t))[run] - 3
+        k = np.minimum(np.clip(home - 1, first, np.maximum(first, last)), len(t) - 3)
+        slope = (effort[k + 1] - effort[k]) / (t[k + 1] - t[k])
+        bend = ((effort[k + 2] - effort[k + 1]) / (t[k + 2] - t[k + 1]) - slope) / (t[k + 2] - t[k])
+        parabola = effort[k] + (grid - t[k]) * (slope + (grid - t[k + 1]) * bend)
+        known = (way[home, i] == own[:, i]) & (first <= last)
+        out[:, i] = np.where(known, parabola, np.interp(grid, t, effort))
+    return out
 
 
 def _eroded(moving: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
