@@ -121,6 +121,14 @@ def test_a_design_that_is_not_possible_is_refused_in_a_line(words, message, tmp_
     assert message in error and error.count("\n") == 1 and not [*tmp_path.iterdir()]
 
 
+def test_a_joint_whose_range_is_0_is_named(tmp_path):
+    """Many URDFs have limits of 0 as placeholders."""
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(re.sub('lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"', ARM.read_text("utf-8"), count=1))
+    with pytest.raises(InputError, match="joint 'joint1' has a range of 0 in the URDF: correct its limits, or `lock`"):
+        twodof.excite(urdf, 5.0, "payload")
+
+
 def test_the_work_of_a_search_is_limited(monkeypatch, caplog):
     """Two seconds of processor time for each step would be hours for a humanoid."""
     steps: list[tuple[int, int]] = []

@@ -104,6 +104,9 @@ class _Design:
         self._reach = MARGIN * np.where(limited, 0.5 * high - 0.5 * low, REACH)
         self._speed = MARGIN * np.where(np.isfinite(speed), speed, SPEED)
         self._effort = MARGIN * np.array(robot.effort)
+        for joint, reach in zip(robot.joints, self._reach):
+            if not reach > 0.0:
+                raise InputError(f"joint '{joint}' has a range of 0 in the URDF: correct its limits, or `lock` it")
         still = self._sampled(np.zeros(self.shape), COARSE)
         for joint, effort, most in zip(robot.joints, np.abs(still.tau[0]), self._effort):
             if effort >= most:
