@@ -203,6 +203,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         q[:, 1] = 0.3 + 1e-4 * np.random.default_rng(0).normal(size=len(q))
     elif change == "spikes":
         q[np.random.default_rng(0).choice(len(q), 6), 1] += 0.3
+    elif change == "wrapped":
+        q[:, 1] = (q[:, 1] - 0.6) % (2.0 * np.pi)
     elif change == "degrees":
         q = np.degrees(q)
     elif change == "nan":
@@ -229,6 +231,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("short", "is too short"),
         ("still", "joint 'joint2' never moves"),
         ("spikes", "the position of joint 'joint2' in"),
+        ("wrapped", "jumps by a turn at"),
         ("degrees", "rad: they are probably in degrees"),
         ("nan", "the position of joint 'joint2' at 7 s is not a number"),
         ("huge", "the position of joint 'joint2' at 7 s is beyond 1e+100"),
@@ -315,6 +318,10 @@ def test_damping_of_a_robot_of_one_joint_is_found(tmp_path):
     result = twodof.fit(urdf, bag_of(tmp_path / "bag", ["hub"], q, 0.1 * a + 0.3 * v), "damping[*]")
     (damping,) = result.parameters
     assert damping.after == pytest.approx(0.3, abs=1e-3)
+    wrapped = (q + 3.0 + np.pi) % (2.0 * np.pi) - np.pi  # an encoder of one turn
+    assert np.ptp(np.diff(wrapped, axis=0)) > 6.0
+    bag = bag_of(tmp_path / "wrapped", ["hub"], wrapped, 0.1 * a + 0.3 * v)
+    assert twodof.fit(urdf, bag, "damping[*]").parameters[0].after == pytest.approx(0.3, abs=1e-3)
 
 
 def test_one_of_millions_of_wrong_values_is_named_without_a_list_of_all() -> None:

@@ -19,6 +19,7 @@ from ..bag.recording import Recording
 from ..bounds import MAX_VALUE
 from ..errors import InputError, choice
 from ..plant.robot import Robot
+from ..plant.urdf import UNBOUNDED
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger(__name__)
@@ -38,6 +39,7 @@ SPIKES = 0.01  # largest fraction of samples that are spikes
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
 MIXED = 0.03  # second difference of positions between close samples, as part of their range, that shows mixed samples
+WRAP = 0.1  # part of a turn by which a step without its whole turn may differ from the step before it
 MOST_FITTED, MOST_HELD = 100_000, 6000
 """Samples that are fitted, and that are held out and simulated; of longer recordings, evenly spread parts are used."""
 PIECE = 20_000  # samples whose regressors are in memory together
@@ -98,6 +100,7 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
             raise InputError(f"'{name}' has too few joint states, or several at one time")
         if (np.diff(t) == 0.0).any():
             raise InputError(f"'{name}' has several joint states at one time: are there two recordings in it?")
+        q = _unwrapped(recording, robot, q)
         close, rough = np.minimum(np.diff(t)[1:], np.diff(t)[:-1]) < 0.9 * h, np.abs(np.diff(q, 2, axis=0)).max(axis=1)
         if close.any() and np.median(rough[close]) > max(MIXED * np.ptp(q, axis=0).max(), 5.0 * np.median(rough)):
             at = t[1:-1][close][rough[close].argmax()]
@@ -127,6 +130,30 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
                 " moving"
             )
     return _thinned(fitted, MOST_FITTED, "for the fit"), _thinned(held, MOST_HELD, "held out")
+
+
+def _unwrapped(recording: Recording, robot: Robot, q: Array) -> Array:
+    """Return positions in which joints without limits have no jumps of a turn; some encoders wrap at ±π.
+
+    A step is a wrap if it is within a tenth of a turn of the step before it and one turn.
+
+    Raises:
+        InputError: a joint with limits jumps by a turn.
+    """
+    late = np.diff(recording.t)
+    turn, steps = 2.0 * np.pi, np.diff(q, axis=0)
+    turns = np.where(np.array(robot.prismatic), 0.0, np.round(steps / turn))
+    before = np.vstack([steps[:1], steps[:-1]])
+    turns[np.abs(steps - turn * turns - np.where(np.abs(before) < turn / 2.0, before, 0.0)) > WRAP * turn] = 0.0
+    for i, joint in enumerate(robot.joints):
+        jumps = np.flatnonzero(turns[:, i] * (late < GAP * np.median(late)))
+        if robot.q_min[i] > -UNBOUNDED and len(jumps):
+            at = recording.t[1 + jumps[0]]
+            raise InputError(
+                f"the position of joint '{joint}' in '{recording.path}' jumps by a turn at {at:.4g} s, but the joint"
+                " has limits: correct the positions, or make the joint continuous"
+            )
+    return q - turn * np.vstack([np.zeros_like(q[:1]), np.cumsum(turns, axis=0)])
 
 
 def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
