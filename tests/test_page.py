@@ -95,7 +95,7 @@ def alive(browser: Browser, arm: Path) -> Iterator[Page]:
 @pytest.fixture
 def page(alive: Page) -> Page:
     """The default arm's page, at its start and paused."""
-    alive.evaluate("() => { arm.play(false); arm.startAgain(true); }")
+    alive.evaluate("() => { arm.play(false); arm.startAgain(true); arm.message = ''; }")
     press(alive, "View")
     return alive
 
