@@ -213,6 +213,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         q[700, 1] = 1e300
     elif change == "millinewton":
         effort = 1000.0 * effort
+    elif change == "millinewton of one":
+        effort = effort * [1.0, 1000.0]
     elif change == "repeated":
         stamps[500:] -= stamps[500] - stamps[200]
     elif change == "set back":  # by 0.403 s, so that samples are mixed
@@ -236,6 +238,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("nan", "the position of joint 'joint2' at 7 s is not a number"),
         ("huge", "the position of joint 'joint2' at 7 s is beyond 1e+100"),
         ("millinewton", "a factor of 1000"),
+        ("millinewton of one", "the recorded efforts of joint 'joint2' are"),
         ("repeated", "several joint states at one time"),
         ("set back", "was the clock set back"),
         ("no efforts", "has no efforts"),

@@ -193,7 +193,16 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
     for joint, effort in zip(robot.joints, theirs):
         if not effort:
             raise InputError(f"the effort of joint '{joint}' is 0 throughout: it was not recorded")
-    ratio = float(np.median(theirs / np.maximum(ours, 1e-12)))
+    ratios = theirs / np.maximum(ours, 1e-12)
+    high = np.flatnonzero(ratios > WRONG_UNITS).tolist()
+    # friction of a joint with little load can have such a ratio, but is smaller than the largest load of the robot
+    if len(high) == 1 < len(ratios) and theirs[high[0]] == max(theirs.max(), ours.max()):
+        raise InputError(
+            f"the recorded efforts of joint '{robot.joints[high[0]]}' are {ratios[high[0]]:.2g} times those of the"
+            " URDF's masses, unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them,"
+            " or correct the masses"
+        )
+    ratio = float(np.median(ratios))
     if not 1.0 / WRONG_UNITS < ratio < WRONG_UNITS:
         raise InputError(
             f"the recorded efforts are {ratio:.2g} times those of the URDF's masses: they are probably not in N·m,"
