@@ -14,6 +14,11 @@ import pytest
 from friction_oracle import Rubbing
 from native_models import Engine, Model, Reduced, engine, from_urdf, model, robots_folder, urdf_path
 
+from twodof.export import native as header
+from twodof.plant import regime
+from twodof.plant.plant import DiscardError
+
+MANY_EVALUATIONS = 3
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 SLIDER = """<robot name="slider"><link name="base"/><link name="body"><inertial><mass value="2"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -256,6 +261,23 @@ def test_a_robot_that_sticks_stays_bit_for_bit_and_costs_nothing(monkeypatch):
     for _ in range(10):
         plant.step(0.01)
     assert (plant.q, plant.v, len(calls)) == (start, [0.0] * 6, 10)
+
+
+@pytest.mark.parametrize("python", [False, True])
+def test_short_steps_count_in_the_budget(python, monkeypatch):
+    """Friction stops the joint after 20 µs, to which a short step leads."""
+    monkeypatch.setattr(regime, "BUDGET", 1)
+    monkeypatch.setattr(header, "BUDGET", 1)
+    of = Engine(from_urdf(SLIDER, "body", "x", "effort"))
+    plant = of.model.plant()
+    plant.gravity, plant.v_start, plant.friction = [0.0] * 3, [1e-3], [50.0 * MASS]
+    plant.initialise()
+    if python:
+        with pytest.raises(DiscardError, match="evaluations"):
+            plant.step(1e-4)
+    else:
+        assert of.call("advance", of.values(plant), 1e-4) == 0
+        assert of.failure()[0] == MANY_EVALUATIONS
 
 
 @pytest.mark.parametrize("rigid", [False, True])

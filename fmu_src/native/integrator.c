@@ -134,8 +134,8 @@ static double short_step(Step *step, double left, int rank_held, Event *event)
     return first_event(step, rank_held, event);
 }
 
-/* Integrate from the time t and the state y until an event or the end; return the time, with y the state there, or NaN
-   on failure. */
+/* Integrate from the time t and the state y until an event, the end, or the end of the budget; return the time, with y
+   the state there, or NaN on failure. */
 static double until_event(Step *step, double t, double end, int rank_held, int *integrator, Event *event,
                           Failure *failure)
 {
@@ -181,9 +181,7 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
             }
         }
     }
-    failure->reason = MANY_EVALUATIONS;
-    find_fastest(step, failure);
-    return NAN;
+    return t;
 }
 
 /* Advance the plant's state by h seconds with inputs held, and locate joint stops. On failure return false and leave
@@ -206,7 +204,7 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
     begin_anti_chatter(&chatter, plant);
     for (int i = 0; stopped_at && i < N_JOINTS; i++)
         stopped_at[i] = HUGE_VAL;
-    while (t < h) {
+    while (t < h && step.evaluations <= BUDGET) {
         const int before = step.stops.rank, rank_held = chatter.rank.until > t;
         const double end = hold_joints(&chatter, &step, t, h, kept);
         set_out(&step, chatter.joints_held, kept, rank_held);
@@ -222,7 +220,11 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
                 stopped_at[i] = fmin(stopped_at[i], t);
     }
     *evaluations = step.evaluations;
-    if (isnan(t))
+    if (t < h) {
+        failure->reason = MANY_EVALUATIONS;
+        find_fastest(&step, failure);
+    }
+    if (!(t >= h))
         return 0;
     if (!(chatter.joints.until > h))
         memset(chatter.joints_held, 0, sizeof chatter.joints_held);

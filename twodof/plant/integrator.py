@@ -72,6 +72,7 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
     soon, longest = chatter_time, chatter_time  # times of the holds at limits
     chattering, anti_chatter = [False] * n, [False] * n
     while t < h:
+        motion.check_budget(y)
         if any(chattering):
             joint_hold.again(t, soon, longest, first)
             anti_chatter = chattering

@@ -145,7 +145,10 @@ class Motion:
         return self.atol + self.rtol * abs(q)
 
     def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
-        """Integrate from t, with ẏ at y, until an event or the end; return the time, the state and the event."""
+        """Integrate from t, with ẏ at y, until an event, the end, or the end of the budget.
+
+        Return the time, the state and the event.
+        """
         if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
             return end, y, events.Event()  # inputs and all joints are held: nothing changes
         soon = None if self._stiff else self._short_step(y, rates, end - t)
@@ -153,7 +156,7 @@ class Motion:
             passed, y, event = soon
             return end if passed == end - t else t + passed, y, event
         step, growth = min(self.max_step, end - t), MAX_FACTOR
-        while True:
+        while self.evaluations <= BUDGET:
             last = t + step * (1 + 1e-9) >= end
             if last:
                 step = end - t
@@ -194,8 +197,12 @@ class Motion:
                             " inputs, payload or speeds are too large"
                         )
                     raise self._too_fast(y, too_fine=True)
-            if self.evaluations > BUDGET:
-                raise self._too_fast(y, too_fine=False)
+        return t, y, events.Event()
+
+    def check_budget(self, y: State) -> None:
+        """Raise StepError at y if no evaluations are left."""
+        if self.evaluations > BUDGET:
+            raise self._too_fast(y, too_fine=False)
 
     def _share(self, step: float) -> float:
         """Return the fraction of the tolerances that a step may use."""
