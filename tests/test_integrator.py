@@ -12,7 +12,7 @@ FREE = [(-np.inf, np.inf)]
 
 
 def without_friction(limits, W=None):
-    return Stops(limits, [0.0] * len(limits), lambda q: W, rigid=W is not None)
+    return Stops(limits, [0.0] * len(limits), lambda q: W, lambda y, a: np.zeros(len(a)), rigid=W is not None)
 
 
 def advance(acceleration, q, v, h, limits, *tolerances):

@@ -17,6 +17,7 @@
 #include "joint_control.c"
 #endif
 #include "plant.c"
+#include "contacts.c"
 #include "stops.c"
 #ifndef IS_COMPLEX
 #include "jacobian.c"

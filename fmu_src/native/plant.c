@@ -7,6 +7,7 @@
    for any a, where s are the directions in which joints slip against their friction F. With a = q̈_cmd, the dynamics
    cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ
    where it is known; the armature is in both. Links whose masses are inputs have the URDF's values in M̂ and ĥ. */
+#include <math.h>
 #include <stddef.h>
 #include <string.h>
 
@@ -229,6 +230,29 @@ INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS],
         a[i] = rests[i] ? 0.0 : a[i] + further[i];
         reaction[i] = rests[i] ? effort[i] - excess[i] : 0.0;
     }
+}
+
+/* The largest effort on a joint at the velocities v and accelerations a: the sum of the magnitudes of its parts. Their
+   sum itself may be a rounding error. */
+static double acting_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                            const double a[N_JOINTS])
+{
+    const double *value = plant->value, still[N_JOINTS] = {0};
+    double needed[N_JOINTS], bias[N_JOINTS], further[N_JOINTS], largest = 0.0;
+    JointPosition joint[N_BODIES];
+    EndBody end_body[N_LOADED];
+    place_joints(q, joint);
+    body(value, 0, end_body);
+    inverse_dynamics(joint, end_body, &value[ARMATURE], v, a, &value[GRAVITY], needed);
+    inverse_dynamics(joint, end_body, &value[ARMATURE], v, still, &value[GRAVITY], bias);
+    effort_of_force(joint, &value[F_EXT], further);
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double friction = v[i] != 0.0 ? value[FRICTION + i] : 0.0;
+        const double sum = fabs(needed[i]) + fabs(bias[i]) + fabs(further[i]) + fabs(value[TAU_EXT + i])
+                           + fabs(value[DAMPING + i] * v[i]) + friction;
+        largest = sum <= largest ? largest : sum;
+    }
+    return largest;
 }
 
 /* a and λ of M(q) a = τ + λ, as in hybrid_dynamics. */

@@ -41,7 +41,7 @@ static int are_whole(const double value[])
 /* Check that the values of held, watched and slip are valid; recompute any_*. */
 static int are_stops(Stops *stops)
 {
-    int sound = stops->rank >= 0 && stops->rank <= N_ROWS;
+    int sound = stops->rank >= 0 && stops->rank <= N_ROWS && stops->acting >= 0.0 && isfinite(stops->acting);
     stops->any_held = stops->any_watched = stops->any_slip = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         const int held = stops->held[i], watched = stops->watched[i], slip = stops->slip[i];

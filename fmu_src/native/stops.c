@@ -9,9 +9,6 @@
 #include <stddef.h>
 #include <string.h>
 
-enum { MOST_PIVOTS = 10000, BLOCK_TRIES = 5 };
-/* 2⁻⁴⁰: rounding error of a sum whose sign decides, relative to its terms. */
-static const double ROUNDING_OF_SUM = 1.0 / 1099511627776.0;
 static const double USUAL_RTOL = 1e-3;
 
 /* The directions of slip in a regime; NULL if no joint slips. */
@@ -75,101 +72,6 @@ INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_
 }
 
 #ifndef IS_COMPLEX
-/* A joint at a limit or at rest. */
-typedef struct {
-    int there;        /* whether an effort or impulse acts on it */
-    int fixed;        /* whether the joint rests in any case, without bounds */
-    double side;      /* at a limit, the sign of the direction into the range; else 0 */
-    double low, high; /* bounds of the effort or impulse */
-    int at;           /* active bound: −1 or 1; 0 if the joint rests */
-} Contact;
-
-static int has_no_range(const Plant *plant, int i)
-{
-    return plant->value[Q_MIN + i] == plant->value[Q_MAX + i];
-}
-
-/* Find the joints at limits; stops of joints without a range, and of those in kept, act in both directions. */
-static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int kept[N_JOINTS],
-                          Contact contact[N_JOINTS])
-{
-    const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
-    for (int i = 0; i < N_JOINTS; i++) {
-        const double side = q[i] >= high[i] ? -1.0 : q[i] <= low[i] ? 1.0 : 0.0;
-        const Contact own = {.there = side != 0.0, .fixed = kept[i] || has_no_range(plant, i), .side = side,
-                             .low = side < 0.0 ? -HUGE_VAL : 0.0, .high = side > 0.0 ? HUGE_VAL : 0.0};
-        contact[i] = own;
-    }
-}
-
-/* True if the stop of a joint acts against a velocity or an acceleration. */
-static int is_pressed(const Contact *contact, double rate)
-{
-    return contact->there && (contact->fixed ? rate != 0.0 : contact->side * rate < 0.0);
-}
-
-static double bound(const Contact *contact)
-{
-    return contact->at < 0 ? contact->low : contact->at > 0 ? contact->high : 0.0;
-}
-
-/* The active bound that corrects a contact: a new one if the effort exceeds a bound, or if the rate has the wrong sign
-   at a bound; otherwise the present one. */
-static int mended(const Contact *contact, double acts, double rate, double slack)
-{
-    if (!contact->there || contact->fixed)
-        return contact->at;
-    if (contact->at)
-        return contact->at * rate > slack ? 0 : contact->at;
-    return acts < contact->low - slack ? -1 : acts > contact->high + slack ? 1 : 0;
-}
-
-/* Solve a linear complementarity problem for rate + M⁻¹z, with z within the contacts' bounds: the result is above 0
-   only if z is at its lower bound, and below 0 only if z is at its upper bound. Each iteration changes all violated
-   contacts (block pivoting). If their number does not decrease for some iterations, only the last one changes, which
-   terminates for every positive definite M. Returns whether a solution was found, with the rates and z.
-   Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974. */
-static int complementary(const Plant *plant, const double q[N_JOINTS], Contact contact[N_JOINTS],
-                         double rate[N_JOINTS], double z[N_JOINTS])
-{
-    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0};
-    int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0, count = 1, finite = 1, bounded = 0;
-    for (int i = 0; i < N_JOINTS; i++) {
-        const int resists = contact[i].there && contact[i].high > 0.0 && contact[i].low < 0.0;
-        const int rests = (contact[i].there && contact[i].fixed) || resists || is_pressed(&contact[i], rate[i]);
-        contact[i].at = rests || !contact[i].there ? 0 : contact[i].side > 0.0 ? -1 : 1;
-        free[i] = rests ? 0.0 : 1.0;
-        any |= rests;
-        bounded |= contact[i].there;
-        finite &= isfinite(rate[i]) != 0;
-    }
-    for (int pivot = 0; any && finite && count > 0 && pivot < MOST_PIVOTS; pivot++) {
-        int wrong[N_JOINTS], next[N_JOINTS];
-        double largest = 0.0;
-        count = 0;
-        for (int i = 0; i < N_JOINTS; i++)
-            given[i] = free[i] == 0.0 ? -rate[i] : bound(&contact[i]);
-        hybrid_motion(plant, q, &plant->value[ARMATURE], free, given, change, z);
-        for (int i = 0; i < N_JOINTS; i++)
-            largest = fmax(largest, free[i] == 0.0 ? fabs(z[i]) : 0.0);
-        for (int i = 0; i < N_JOINTS; i++) {
-            const double size = free[i] == 0.0 ? largest : fabs(rate[i]) + fabs(change[i]);
-            next[i] = mended(&contact[i], z[i], rate[i] + change[i], ROUNDING_OF_SUM * size);
-            if (next[i] != contact[i].at)
-                wrong[count++] = i;
-        }
-        tries = count < fewest ? BLOCK_TRIES : tries - 1;
-        fewest = count < fewest ? count : fewest;
-        for (int k = tries > 0 || count == 0 ? 0 : count - 1; k < count; k++) {
-            contact[wrong[k]].at = next[wrong[k]];
-            free[wrong[k]] = next[wrong[k]] == 0 ? 0.0 : 1.0;
-        }
-    }
-    for (int i = 0; i < N_JOINTS; i++)
-        rate[i] = free[i] == 0.0 ? 0.0 : rate[i] + change[i];
-    return !bounded || (finite && (!any || count == 0));
-}
-
 /* Fraction of the times within which events at rigid stops are one: they shrink with rtol below its default. */
 INTERNAL double coarseness(const Plant *plant)
 {
@@ -187,7 +89,7 @@ static int impact(const Plant *plant, double y[N_STATES], const int anti_chatter
     find_contacts(plant, y, anti_chatter, contact);
     for (int i = 0; i < N_JOINTS; i++)
         any |= is_pressed(&contact[i], v[i]);
-    if (any && plant->value[RIGID_STOPS] != 0.0 && !complementary(plant, y, contact, v, impulse))
+    if (any && plant->value[RIGID_STOPS] != 0.0 && !complementary(plant, y, contact, 0.0, v, impulse))
         v[0] = NAN; /* which no step accepts */
     else if (plant->value[RIGID_STOPS] == 0.0)
         for (int i = 0; i < N_JOINTS; i++)
@@ -218,7 +120,7 @@ static int stop_within(const Plant *plant, double window, double y[N_STATES], co
         rate[i] = v[i] + window * a[i];
         any |= own->there && rate[i] * v[i] < 0.0;
     }
-    if (!any || !complementary(plant, y, contact, rate, impulse))
+    if (!any || !complementary(plant, y, contact, window * acting_effort(plant, y, v, a), rate, impulse))
         return 0;
     for (int i = 0; i < N_JOINTS; i++) {
         free[i] = contact[i].there && rate[i] == 0.0 ? 0.0 : 1.0;
@@ -276,6 +178,7 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
     const double *v = y + N_JOINTS;
     Contact contact[N_JOINTS];
     double stopped[N_JOINTS];
+    int any = 0;
     memset(stops, 0, sizeof *stops);
     for (int i = 0; i < N_JOINTS; i++) {
         stops->slip[i] = plant->value[FRICTION + i] > 0.0 ? (v[i] > 0.0) - (v[i] < 0.0) : 0;
@@ -289,12 +192,16 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
     find_contacts(plant, y, kept, contact);
     if (!add_friction(plant, v, contact))
         return;
+    for (int i = 0; i < N_JOINTS; i++)
+        any |= contact[i].there;
+    const double acting = any ? acting_effort(plant, y, v, a) : 0.0;
     memcpy(stopped, a, sizeof stopped);
-    if (!complementary(plant, y, contact, stopped, effort)) {
+    if (!complementary(plant, y, contact, acting, stopped, effort)) {
         for (int i = 0; i < N_JOINTS; i++)
             a[i] = NAN; /* which no step accepts */
         return;
     }
+    stops->acting = acting;
     for (int i = 0; i < N_JOINTS; i++) {
         const Contact *own = &contact[i];
         const int rests = own->there && stopped[i] == 0.0;
@@ -303,8 +210,10 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
             stops->held[i] = CLAMPED;
         else if (rests)
             stops->held[i] = own->side != 0.0 && rigid ? STOPPED : STUCK;
-        if (own->there && !rests && plant->value[FRICTION + i] > 0.0)
+        if (own->there && !rests && plant->value[FRICTION + i] > 0.0) {
             stops->slip[i] = -own->at;
+            stops->acting = fmax(stops->acting, plant->value[FRICTION + i]);
+        }
         stops->any_slip |= stops->slip[i] != 0;
         const int acts_alike = rigid || (stops->held[i] == CLAMPED && !stops->slip[i]); /* whatever the efforts are */
         stops->watched[i] = stops->held[i] && !kept[i] && !(has_no_range(plant, i) && acts_alike);
@@ -330,10 +239,10 @@ INTERNAL double grip(const Plant *plant, const Stops *stops, int i, double q, do
     return friction - side * effort;
 }
 
-/* Bound on the rounding error of the holding efforts. */
+/* Bound on the rounding error of the holding efforts, which may be small differences of the efforts that act. */
 INTERNAL double rounding_of(const Stops *stops, const double effort[N_JOINTS])
 {
-    double largest = 0.0;
+    double largest = stops->acting;
     for (int i = 0; i < N_JOINTS; i++)
         largest = fmax(largest, stops->held[i] ? fabs(effort[i]) : 0.0);
     return 2.0 * ROUNDING_OF_SUM * largest;

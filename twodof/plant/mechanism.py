@@ -69,6 +69,11 @@ class Mechanism:
         rows = J.tolist() if J.ndim == 2 else J.reshape(6, 1).tolist()  # one joint: a vector
         return self._position.tolist(), rows, drift.vector.tolist()
 
+    def effort_of_force(self, q: Array, v: Array, force: Sequence[float]) -> Array:
+        """Return Jᵀ f of a force at the task frame, in the root's axes, n values."""
+        effort: Array = np.array(force) @ np.array(self.observe(q, v)[1][:3])
+        return effort
+
     @property
     def rotation(self) -> Array:
         """Return the rotation matrix of the task frame at the last observed state."""
@@ -82,6 +87,11 @@ class Mechanism:
             return np.asarray(pin.rnea(self._model, self._data, q, v, a))
         tau = pin.rnea(self._model, self._data, G @ q + self._c, G @ v, G @ a)
         return np.asarray(G.T @ tau)
+
+    def effort_sizes(self, q: Array, v: Array, a: Array, force: Sequence[float]) -> Array:
+        """Return |M a + h| + |h| + |Jᵀ f|, N·m or N, n values; f acts at the task frame, in the root's axes."""
+        both = self.inverse_dynamics(q, v, a), self.inverse_dynamics(q, v, np.zeros(len(q)))
+        return np.asarray(np.abs([*both, self.effort_of_force(q, v, force)]).sum(axis=0))
 
     def forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         """Return q̈ = M(q)⁻¹ (τ − h(q, v)), rad/s² or m/s², n values."""

@@ -273,24 +273,24 @@ class Plant(ControlledPlant):
         """Return the equations of motion with the present inputs held, or the effort of a sampled controller."""
         held = effort_control.given_effort(self.sampling.effort)
         command, ratios = held if self.control_period else self._law(self)
-        acceleration = self._acceleration(command)
         rcond = self.rcond if "rcond" in CONTROLS[self.control].parameters else 0.0
-        return Equations(acceleration, ratios, rcond, self._swing, self.damping if any(self.damping) else ())
+        damping = self.damping if any(self.damping) else ()
+        return Equations(self._acceleration(command), ratios, rcond, self._swing, damping)
 
     def _acceleration(self, command: Law) -> Response:
         """Return q̈ under a control law."""
         damping, external = np.array(self.damping), np.array(self.tau_ext)
-        force, friction = np.array(self.f_ext), np.array(self.friction)
+        force, friction = any(self.f_ext), np.array(self.friction)
         # q̈ = q̈_cmd + M⁻¹(…), because rounding of M q̈_cmd + h − h would move joints at rest
         cancels = self._commands == "acceleration" and self.known is self._real
         cancels = cancels and not self.limit_effort and not self.control_period
-        if cancels and not (damping.any() or external.any() or force.any() or friction.any()):
+        if cancels and not (damping.any() or external.any() or force or friction.any()):
             return lambda q, v, rank, slip: command(q, v, rank)
 
         def acceleration(q: Array, v: Array, rank: int | None, slip: Sequence[int]) -> Answer:
             effort = external - damping * v - friction * slip
-            if force.any():
-                effort += force @ np.array(self._real.observe(q, v)[1][:3])
+            if force:
+                effort += self._real.effort_of_force(q, v, self.f_ext)
             if cancels:
                 given, rank, margin = command(q, v, rank)
                 return np.add(given, self._real.inverse_mass(q) @ effort).tolist(), rank, margin
@@ -306,7 +306,13 @@ class Plant(ControlledPlant):
     def stops(self) -> Stops:
         """Return friction and joint limits as the integrator's stops, rigid or clamping."""
         limits = list(zip(self.q_min, self.q_max))
-        return Stops(limits, self.friction, self._real.inverse_mass, rigid=self.rigid_stops)
+        return Stops(limits, self.friction, self._real.inverse_mass, self._acting_efforts, rigid=self.rigid_stops)
+
+    def _acting_efforts(self, y: Sequence[float], a: Sequence[float]) -> Array:
+        """Return the magnitudes of the efforts on each joint, whose sum itself may be a rounding error, n values."""
+        q, v = np.array(y).reshape(2, -1)
+        given = np.abs(self.tau_ext) + np.abs(np.multiply(self.damping, v))
+        return np.asarray(given + self._real.effort_sizes(q, v, np.array(a), self.f_ext))
 
     def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
         return self._real.observe(np.array(self.q), np.array(self.v))

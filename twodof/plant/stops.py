@@ -27,6 +27,8 @@ Limits = Sequence[tuple[float, float]]
 """(q_min, q_max) of each joint, rad or m."""
 InverseMass = Callable[[Sequence[float]], Array]
 """M(q)⁻¹, n × n."""
+ActingEfforts = Callable[[Sequence[float], Sequence[float]], Array]
+"""Magnitudes of the efforts on each joint, without friction, at (q, v) and q̈, n values."""
 Bounds = Mapping[int, tuple[float, float]]
 """Bounds of efforts or impulses, by joint."""
 
@@ -44,6 +46,7 @@ class Stops:
         limits: position limits of the joints.
         friction: Coulomb friction of the joints, N·m or N, n values.
         inverse_mass: function that returns M⁻¹; called only with friction or rigid stops.
+        acting_efforts: function that returns the magnitudes of efforts; called only with friction or rigid stops.
         rigid: whether stops have a reaction.
 
     Attributes:
@@ -54,8 +57,17 @@ class Stops:
         watched: held joints that are released when the holding effort exceeds its bounds.
     """
 
-    def __init__(self, limits: Limits, friction: Sequence[float], inverse_mass: InverseMass, *, rigid: bool) -> None:
-        self.limits, self._friction, self._inverse_mass, self.rigid = limits, friction, inverse_mass, rigid
+    def __init__(
+        self,
+        limits: Limits,
+        friction: Sequence[float],
+        inverse_mass: InverseMass,
+        acting_efforts: ActingEfforts,
+        *,
+        rigid: bool,
+    ) -> None:
+        self.limits, self._friction, self.rigid = limits, friction, rigid
+        self._inverse_mass, self._acting_efforts, self._acting = inverse_mass, acting_efforts, 0.0
         self.rest, self.slip = [FREE] * len(limits), [0] * len(limits)
         self.held: list[int] = []
         self.watched: list[int] = []
@@ -77,7 +89,7 @@ class Stops:
         if self.rigid:
             W = self._inverse_mass(y[:n])
             bounds = {i: (0.0, inf) if side > 0.0 else (-inf, 0.0) for i, side in sides.items()}
-            impulse, _ = _complementary(W, y[n:], bounds, fixed)
+            impulse, _ = _complementary(W, y[n:], bounds, fixed, 0.0)
             y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
             into = [i for i in sides if impulse[i]]
         for i in into:
@@ -103,7 +115,7 @@ class Stops:
             return False
         W = self._inverse_mass(y[:n])
         fixed = [i for i in bounds if (kept[i] or self._has_no_range(i)) and (i in sides or v[i] == 0.0)]
-        _, at = _complementary(W, rates, bounds, fixed)
+        _, at = _complementary(W, rates, bounds, fixed, window * self._largest_effort(y, a))
         resting = [i for i, state in at.items() if state == 0]
         v += W[:, resting] @ np.linalg.solve(W[np.ix_(resting, resting)], -v[resting])
         v[resting] = 0.0
@@ -137,11 +149,12 @@ class Stops:
             if y[n + i] == 0.0 and (friction or (i in sides and self.rigid)):
                 side = sides.get(i, 0.0) if self.rigid else 0.0
                 bounds[i] = -inf if side < 0.0 else -friction, inf if side > 0.0 else friction
-        stopped, at = a, dict.fromkeys(bounds, 0)
+        stopped, at, self._acting = a, dict.fromkeys(bounds, 0), 0.0
         if bounds:
-            W = self._inverse_mass(y[:n])
-            acting, at = _complementary(W, a, bounds, [i for i in bounds if i in locked and i not in clamps])
-            stopped = (W @ acting + a).tolist()
+            W, self._acting = self._inverse_mass(y[:n]), self._largest_effort(y, a)
+            fixed = [i for i in bounds if i in locked and i not in clamps]
+            reaction, at = _complementary(W, a, bounds, fixed, self._acting)
+            stopped = (W @ reaction + a).tolist()
         resting = {i for i, state in at.items() if state == 0 or stopped[i] == 0.0}
         for i in range(n):
             self.rest[i] = FREE
@@ -151,7 +164,7 @@ class Stops:
                 self.rest[i] = CLAMPED
         begun = {i: -state for i, state in at.items() if i not in resting and self._friction[i]}
         for i, direction in begun.items():
-            self.slip[i] = direction
+            self.slip[i], self._acting = direction, max(self._acting, self._friction[i])
         if begun:
             a[:] = (W @ [-self._friction[i] * begun.get(i, 0) for i in range(n)] + a).tolist()
         self.held = [i for i, rest in enumerate(self.rest) if rest]
@@ -175,7 +188,7 @@ class Stops:
             efforts = {i: -a[i] for i in self.held} | dict(zip(reacting, reaction.tolist()))
         for i in self.held:
             a[i] = 0.0
-        slack = 2.0 * ROUNDING * max(map(abs, efforts.values()))  # a released joint moves
+        slack = 2.0 * ROUNDING * max(self._acting, *map(abs, efforts.values()))  # a released joint moves
         return [grip + slack for i in self.watched for grip in self._grips(i, y[i], efforts[i])]
 
     def mobility(self, q: Sequence[float]) -> Array:
@@ -190,6 +203,11 @@ class Stops:
     def at_limits(self, y: Sequence[float]) -> list[bool]:
         """Return for each joint whether it is at a limit, in the state (q, v)."""
         return [not low < q < high for (low, high), q in zip(self.limits, y)]
+
+    def _largest_effort(self, y: Sequence[float], a: Sequence[float]) -> float:
+        """Return the largest effort on a joint, with the friction of moving joints."""
+        friction = [F if v else 0.0 for v, F in zip(y[len(a) :], self._friction)]
+        return float(np.add(self._acting_efforts(y, a), friction).max())
 
     def _grips(self, i: int, q: float, effort: float) -> tuple[float, float]:
         friction = 0.0 if self.rest[i] == CLAMPED else self._friction[i]
@@ -217,17 +235,18 @@ class Stops:
 
 
 def _complementary(
-    W: Array, b: Sequence[float], bounds: Bounds, fixed: Collection[int]
+    W: Array, b: Sequence[float], bounds: Bounds, fixed: Collection[int], acting: float
 ) -> tuple[Array, dict[int, int]]:
     """Return the solution z (n values) of a linear complementarity problem, and its active bounds.
 
     The active bound of a joint with bounds is −1 for the lower, 1 for the upper, and 0 for none. b + W z is above 0
     only if z is at its lower bound, below 0 only if z is at its upper bound, and 0 for ``fixed`` joints, whose z has
-    no bounds. Each iteration changes all violated conditions (block pivoting). If their number does not decrease for
-    some iterations, only the last one changes, which terminates for every positive definite W. Sources: Júdice &
-    Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974.
+    no bounds. z exceeds a bound only if it does so by more than the rounding error of the largest effort or impulse,
+    of z and of those that act besides (``acting``). Each iteration changes all violated conditions (block pivoting).
+    If their number does not decrease for some iterations, only the last one changes, which terminates for every
+    positive definite W. Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974.
     """
-    if not np.isfinite(b).all():
+    if not np.isfinite([*b, acting]).all():
         raise np.linalg.LinAlgError("not finite")
     at = {}
     for i, (low, high) in bounds.items():
@@ -241,10 +260,9 @@ def _complementary(
         for i, state in at.items():
             z[i] = 0.0 if state == 0 else bounds[i][state > 0]
         solved = [i for i, state in at.items() if state == 0]
-        largest = 0.0
         if solved:
             z[solved] = np.linalg.solve(W[np.ix_(solved, solved)], -(given + W @ z)[solved])
-            largest = np.abs(z[solved]).max()
+        largest = max(acting, np.abs(z).max())
         change = W @ z
         wrong = {}
         for i, (low, high) in bounds.items():
