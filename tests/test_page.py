@@ -576,7 +576,9 @@ def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path, capsys) 
     assert messages[0].name == list(bag.joints)
     with Reader(path) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
-    assert counts == dict.fromkeys(("/joint_states", "/end_effector", "/target"), 1701)
+    streams = ("/joint_states", "/tf", "/end_effector", "/target")
+    assert counts == {"/robot_description": 1, "/tf_static": 1, **dict.fromkeys(streams, 1701)}
+    assert_scene_of_a_run(path, panda, script, tmp_path)
     told = bag.provenance
     assert told["fmu"]["guid"] == twodof.load_fmu(panda).guid
     assert told["start_values"]["payload"] == 0.5 and told["start_values"]["Kd[1]"] == 30.0
@@ -594,6 +596,46 @@ def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path, capsys) 
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(BagError, match="ends in the middle"):
         twodof.read_bag(path)
+
+
+def assert_scene_of_a_run(path: Path, fmu: Path, script: Script, folder: Path) -> None:
+    """Assert that a page's bag has the same scene as a run of the same inputs, stamps apart."""
+    settings = {"payload": 0.5, "Kd": 30.0, **script[0]}
+    changes = [(0.01 * k, values) for k, values in script.items() if k]
+    bag = twodof.Bag(folder / "run", scene=True, effort=True)
+    twodof.simulate(fmu, bag, stop_time=17.0, settings=settings, changes=changes)
+    (run,) = (folder / "run").glob("*.mcap")
+    topics = ["/robot_description", "/tf_static", "/tf", "/end_effector"]
+    with Reader(folder / "run") as reader, Reader(path) as own:
+        for topic in (*topics, "/joint_states", "/target"):
+            theirs, ours = ([c for c in each.connections if c.topic == topic] for each in (reader, own))
+            assert [(c.msgtype, c.msgdef, c.ext) for c in ours] == [(c.msgtype, c.msgdef, c.ext) for c in theirs]
+    read, expected = ([*read_ros2_messages(each, topics=topics)] for each in (path, run))
+    first = read[0].ros_msg, expected[0].ros_msg
+    assert first[0].data == first[1].data and ET.fromstring(first[0].data).find(".//mesh") is None
+    begin, since = read[0].log_time_ns, expected[0].log_time_ns
+    assert [(m.channel.topic, m.log_time_ns - begin) for m in read] == [
+        (m.channel.topic, m.log_time_ns - since) for m in expected
+    ]
+    for ours, theirs in zip(read, expected):
+        if ours.channel.topic.startswith("/tf"):
+            assert [*map(frames, ours.ros_msg.transforms)] == [*map(frames, theirs.ros_msg.transforms)]
+            assert {stamped(each) for each in ours.ros_msg.transforms} == {ours.log_time_ns}
+            poses = ([pose(each) for each in m.ros_msg.transforms] for m in (ours, theirs))
+            np.testing.assert_allclose(*poses, rtol=0.0, atol=1e-9)
+
+
+def frames(transform: Any) -> tuple[str, str]:
+    return transform.header.frame_id, transform.child_frame_id
+
+
+def stamped(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def pose(transform: Any) -> list[float]:
+    p, q = transform.transform.translation, transform.transform.rotation
+    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
 
 
 def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:

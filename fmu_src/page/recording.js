@@ -1,14 +1,17 @@
 /**
  * A session as a ROS 2 bag: an MCAP file of serialised messages, with their provenance.
  *
- * Sources: the MCAP specification, version 0; OMG, "DDS-XTypes" 1.3, section 7.4.1, plain CDR.
+ * Source: the MCAP specification, version 0. The page has a template of each topic's message.
  */
+
+import { decoded } from "./unpack.js";
 
 /** @typedef {import("./robot.js").Robot} Robot */
 /** @typedef {import("./session.js").Session} Session */
 
 const MAGIC = [0x89, 0x4d, 0x43, 0x41, 0x50, 0x30, 0x0d, 0x0a];
 const CHUNK = 1 << 20; // bytes
+const SECOND = 1000000000n; // ns
 const OP = {
   header: 1, footer: 2, schema: 3, channel: 4, message: 5, chunk: 6, messageIndex: 7, chunkIndex: 8,
   statistics: 11, metadata: 12, metadataIndex: 13, dataEnd: 15,
@@ -48,15 +51,6 @@ class Bytes {
     return this;
   }
 
-  /** @param {ArrayLike<number>} values */
-  doubles(values) {
-    for (let i = 0; i < values.length; i++) {
-      const at = this.room(8);
-      this.view.setFloat64(at, values[i], true);
-    }
-    return this;
-  }
-
   /** @param {Uint8Array | number[]} content */
   raw(content) {
     const at = this.room(content.length);
@@ -64,16 +58,10 @@ class Bytes {
     return this;
   }
 
-  /** @type {(text: string, end?: string) => Bytes} Append a text after its length. */
-  text(text, end = "") {
-    const content = new TextEncoder().encode(text + end);
+  /** @type {(text: string) => Bytes} Append a text after its length. */
+  text(text) {
+    const content = new TextEncoder().encode(text);
     return this.put(32, content.length).raw(content);
-  }
-
-  /** Append padding before numbers of a size, which CDR aligns relative to the end of its first 4 bytes. */
-  /** @type {(size: number) => Bytes} */
-  align(size) {
-    return this.raw(new Uint8Array((size - ((this.length - 4) % size)) % size));
   }
 
   /** @type {(opcode: number, content: Bytes) => Bytes} */
@@ -89,72 +77,78 @@ function textMap(entries) {
   return new Bytes().put(32, content.length).raw(content.content);
 }
 
-/** @type {(stamp: bigint, frame: string) => Bytes} The header of a message with a stamp in ns. */
-function headed(stamp, frame) {
-  const second = 1000000000n;
-  return new Bytes().raw([0, 1, 0, 0]).put(32, stamp / second, stamp % second).text(frame, "\0");
+/** Return a function that makes the messages of a topic from a stamp, ns, and numbers. */
+/** @type {(topic: TopicFacts) => (stamp: bigint, values: number[]) => Uint8Array} */
+function writer({ plain, stamps, numbers }) {
+  const template = decoded(plain);
+  return (stamp, values) => {
+    const data = template.slice(), view = new DataView(data.buffer);
+    const [seconds, rest] = [Number(stamp / SECOND), Number(stamp % SECOND)];
+    for (const at of stamps) {
+      view.setUint32(at, seconds, true);
+      view.setUint32(at + 4, rest, true);
+    }
+    numbers.forEach((at, i) => view.setFloat64(at, values[i], true));
+    return data;
+  };
 }
 
-/** The messages of a session, in the order of its samples. */
-/** @type {(session: Session, robot: Robot) => Generator<{topic: string, stamp: bigint, data: Uint8Array}>} */
+/** The messages of a session, in the order of its samples; those without numbers hold for all of them. */
+/** @type {(session: Session, robot: Robot) => Generator<{channel: number, stamp: bigint, data: Uint8Array}>} */
 function* messages(session, robot) {
-  const { facts } = session;
-  const root = String(facts.provenance.root), names = facts.joints.map((joint) => joint.name);
+  const at = session.at.bind(session), { topics } = session.facts, writers = topics.map(writer);
+  /** @type {Record<string, (k: number) => number[]>} */
+  const values = {
+    "/joint_states": (k) => ["q", "v", "tau"].flatMap((group) => [...at(group, k)]),
+    "/tf": (k) => robot.poses(k),
+    "/end_effector": (k) => [...robot.end(k), ...at("quat", k)],
+    "/target": (k) => {
+      const position = robot.end(k);
+      session.axes.forEach((axis, i) => (position[axis] = at("x_des", k)[i]));
+      return [...position, ...at("quat_des", k)];
+    },
+  };
   for (let k = 0; k < session.count; k++) {
     const stamp = session.stamp(k);
-    const state = headed(stamp, "").align(4).put(32, names.length);
-    for (const name of names) state.align(4).text(name, "\0");
-    for (const group of ["q", "v", "tau"]) state.align(4).put(32, names.length).align(8).doubles(session.at(group, k));
-    yield { topic: "/joint_states", stamp, data: state.content };
-    const position = robot.end(k);
-    yield { topic: "/end_effector", stamp, data: point(stamp, root, position, session.at("quat", k)) };
-    if (session.groups.has("x_des")) {
-      session.axes.forEach((axis, i) => (position[axis] = session.at("x_des", k)[i]));
-      yield { topic: "/target", stamp, data: point(stamp, root, position, session.at("quat_des", k)) };
-    }
+    for (const [i, { name, numbers }] of topics.entries())
+      if (numbers.length || k === 0) yield { channel: i + 1, stamp, data: writers[i](stamp, values[name]?.(k) ?? []) };
   }
-}
-
-/** @type {(stamp: bigint, frame: string, position: number[], quat: Float64Array) => Uint8Array} */
-function point(stamp, frame, position, quat) {
-  return headed(stamp, frame).align(8).doubles(position).doubles(quat).content;
 }
 
 /** @type {(session: Session, robot: Robot) => Uint8Array} The session as an MCAP file. */
 export function mcap(session, robot) {
-  const pose = session.groups.has("quat") ? "geometry_msgs/msg/PoseStamped" : "geometry_msgs/msg/PointStamped";
-  const topics = ["/joint_states", "/end_effector", ...(session.groups.has("x_des") ? ["/target"] : [])];
-  const types = ["sensor_msgs/msg/JointState", pose], described = new Bytes(), { definitions, qos } = session.facts;
+  const { topics, definitions, provenance } = session.facts, described = new Bytes(), types = Object.keys(definitions);
   types.forEach((type, i) =>
     described.record(OP.schema, new Bytes().put(16, i + 1).text(type).text("ros2msg").text(definitions[type])));
-  topics.forEach((topic, i) =>
-    described.record(OP.channel, new Bytes().put(16, i + 1, i ? 2 : 1).text(topic).text("cdr")
+  topics.forEach(({ name, type, qos }, i) =>
+    described.record(OP.channel, new Bytes().put(16, i + 1, types.indexOf(type) + 1).text(name).text("cdr")
       .raw(textMap({ offered_qos_profiles: qos, topic_type_hash: "" }).content)));
   const file = new Bytes().raw(MAGIC).record(OP.header, new Bytes().text("ros2").text("twodof")).raw(described.content);
-  const indexes = new Bytes();
-  let chunks = 0, chunk = new Chunk(topics);
+  const indexes = new Bytes(), counts = topics.map(() => 0);
+  let chunks = 0, chunk = new Chunk(topics.length);
   const flush = () => {
     if (!chunk.times.length) return;
     indexes.record(OP.chunkIndex, chunk.write(file));
     chunks += 1;
-    chunk = new Chunk(topics);
+    chunk = new Chunk(topics.length);
   };
-  for (const { topic, stamp, data } of messages(session, robot)) {
-    chunk.add(topics.indexOf(topic) + 1, stamp, data);
+  for (const { channel, stamp, data } of messages(session, robot)) {
+    counts[channel - 1] += 1;
+    chunk.add(channel, stamp, data);
     if (chunk.records.length > CHUNK) flush();
   }
   flush();
   const at = file.length, origin = JSON.stringify({
-    format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
+    format: 1, ...provenance, start_time: 0, start_values: session.startValues,
     command_line: "a page in the browser", input_changes: session.changes,
   });
   file.record(OP.metadata, new Bytes().text("twodof").raw(textMap({ "run.json": origin }).content));
   const metadata = new Bytes().put(64, at, file.length - at).text("twodof");
   file.record(OP.dataEnd, new Bytes().put(32, 0));
   const summary = file.length, statistics = new Bytes();
-  statistics.put(64, session.count * topics.length).put(16, 2).put(32, topics.length, 0, 1, chunks).put(64, session.stamp(0), session.stamp(session.k));
-  statistics.put(32, 10 * topics.length);
-  topics.forEach((_, i) => statistics.put(16, i + 1).put(64, session.count));
+  statistics.put(64, counts.reduce((sum, count) => sum + count)).put(16, types.length).put(32, topics.length, 0, 1, chunks);
+  statistics.put(64, session.stamp(0), session.stamp(session.k)).put(32, 10 * topics.length);
+  counts.forEach((count, i) => statistics.put(16, i + 1).put(64, count));
   file.raw(described.content).record(OP.statistics, statistics).raw(indexes.content);
   file.record(OP.metadataIndex, metadata);
   return file.record(OP.footer, new Bytes().put(64, summary, 0).put(32, 0)).raw(MAGIC).content;
@@ -166,10 +160,10 @@ class Chunk {
   /** @type {bigint[]} */
   times = [];
 
-  /** @param {string[]} topics */
+  /** @param {number} topics how many there are */
   constructor(topics) {
     /** @type {[bigint, number][][]} times and offsets of each topic's messages */
-    this.messages = topics.map(() => []);
+    this.messages = Array.from({ length: topics }, () => []);
   }
 
   /** @type {(channel: number, stamp: bigint, data: Uint8Array) => void} */

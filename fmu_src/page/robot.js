@@ -1,6 +1,6 @@
 /** The robot in the samples of a session: links, end effector and target. */
 
-import { angleBetween, multiply, originOf, placed, plus, rotation, turn } from "./matrices.js";
+import { angleBetween, compose, multiply, originOf, placed, plus, rotation, transform, turn } from "./matrices.js";
 
 /** @typedef {import("./samples.js").Samples} Samples */
 
@@ -26,6 +26,18 @@ export class Robot {
       placements.push(multiply(multiply(placements[parent], placement), inner));
     }
     return placements;
+  }
+
+  /** Poses of the moving links in their parents in sample k: positions and quaternions (x, y, z, w) in one list. */
+  /** @type {(k: number) => number[]} */
+  poses(k) {
+    const q = this.session.at("q", k);
+    return this.facts.moving.flatMap((i) => {
+      const { placement, quat, axis, prismatic, column, ratio, offset } = this.facts.links[i], moved = offset + ratio * q[column];
+      const along = plus([0, 0, 0], prismatic ? moved : Math.sin(moved / 2), axis);
+      if (prismatic) return [...transform(placement, along), ...quat];
+      return [...originOf(placement), ...compose(quat, [...along, Math.cos(moved / 2)])];
+    });
   }
 
   /** @type {(k: number) => Float64Array} The transform of the task frame in sample k. */

@@ -16,6 +16,8 @@ interface JointFacts {
 interface Link {
   parent: number;
   placement: number[];
+  /** Rotation of the placement. */
+  quat: number[];
   axis: number[];
   prismatic: boolean;
   column: number;
@@ -55,13 +57,27 @@ interface Facts {
   /** Kinds of causes in their order. */
   causes: string[];
   links: Link[];
+  /** Links that a joint moves, in the order of /tf. */
+  moving: number[];
   frameLink: number;
   shapes: { link: number; placement: number[]; colour: number[] }[];
   meshes: { low: number[]; size: number; vertices: number; triangles: number }[];
   /** Only for a page with an engine: provenance and topics of its bags. */
   provenance: Record<string, unknown>;
+  topics: TopicFacts[];
+  /** Definitions of messages by type. */
   definitions: Record<string, string>;
+}
+
+/** A topic of a bag. */
+interface TopicFacts {
+  name: string;
+  type: string;
   qos: string;
+  /** A message without stamps and numbers, in base64, and the offsets of these. */
+  plain: string;
+  stamps: number[];
+  numbers: number[];
 }
 
 /** An update from the server of a page. */

@@ -1,9 +1,13 @@
 /** Compressed data on a page. */
 
+/** @type {(base64: string) => Uint8Array} */
+export function decoded(base64) {
+  return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+}
+
 /** @type {(id: string) => Promise<ArrayBuffer>} The content of an element, by its id. */
 export async function unpacked(id) {
-  const text = atob(document.getElementById(id)?.textContent ?? ""), bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  const bytes = decoded(document.getElementById(id)?.textContent ?? "");
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
 }
 

@@ -24,11 +24,11 @@ from ..errors import BuildError, PageError
 from ..export.compiler import compile_web_module, compiles_for_the_web, standard_headers
 from ..files import data_file, head_of, read_member, refusing, write_file
 from ..fmu import Fmu, opened, resource_reader
-from ..geometry.kinematics import Kinematics, Placement
+from ..geometry.kinematics import Kinematics, Placement, quaternions
 from ..geometry.shapes import Shape, link_shapes, sphere
-from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
+from ..plant.urdf import UNBOUNDED, Joint, RobotError, read_urdf
 from ..plots.scripts import packed, script
-from ..ros.messages import JOINT_STATE, POINT, POSE, STREAM, definition
+from ..ros.messages import Messages, definition
 from ..simulation.cause import KINDS
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
@@ -121,9 +121,18 @@ def page_of(run: Experiment) -> bytes:
     provenance = provenance_of(run, "")
     provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses only this package
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
-    recorded = {kind: definition(kind) for kind in (JOINT_STATE, POINT, POSE)}
-    topics = {"definitions": recorded, "qos": profile(STREAM)}
-    return arm_page(arm.title, arm, engine, allowed, provenance=provenance, **topics)
+    return arm_page(arm.title, arm, engine, allowed, provenance=provenance, **_topics(run))
+
+
+def _topics(run: Experiment) -> dict[str, object]:
+    """Return topics and message definitions of a bag with the run's scene and efforts."""
+    messages = Messages(run, scene=True, effort=bool(run.fmu.vector("tau")))
+    topics = [
+        {"name": name, "type": kind, "qos": profile(qos), **template}
+        for name, template in messages.templates().items()
+        for kind, qos in [messages.topics[name]]
+    ]
+    return {"topics": topics, "definitions": {kind: definition(kind) for kind, _ in messages.topics.values()}}
 
 
 def is_page(path: Path) -> bool:
@@ -212,13 +221,15 @@ def _facts(arm: Arm) -> tuple[dict[str, object], bytes]:
     urdf = read_urdf(arm.urdf)
     ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
     packed = [_mesh(shape) for shape in [ball, *arm.shapes]]
-    links, number = _links(urdf, arm.facts["joints"])
+    kinematics = Kinematics(urdf, arm.facts["joints"])
+    links, number = _links(kinematics)
     facts = {
         **arm.facts,
         "joints": [_joint(name, urdf.joints.get(name)) for name in arm.facts["joints"]],
         "recorded": RECORDED,
         "causes": [*KINDS],
         "links": links,
+        "moving": [number[joint.child] for joint in urdf.joints.values() if kinematics.moves(joint)],
         "frameLink": number[arm.facts["frame"]],
         "shapes": [{"link": number[s.link], "placement": _matrix(s.transform), "colour": s.colour} for s in arm.shapes],
         "meshes": [facts for facts, _ in packed],
@@ -235,9 +246,9 @@ def _joint(name: str, joint: Joint | None) -> dict[str, object]:
     return {"name": name, "prismatic": joint.prismatic, "damping": joint.damping, **finite}
 
 
-def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], dict[str, int]]:
+def _links(kinematics: Kinematics) -> tuple[list[dict[str, object]], dict[str, int]]:
     """Return the tree of links, parents first, with the joint above each, and link numbers by name."""
-    kinematics = Kinematics(urdf, joints)
+    urdf = kinematics.urdf
     number = {urdf.root: 0}
     links: list[dict[str, object]] = [{"parent": -1}]
     for joint in sorted(urdf.joints.values(), key=lambda joint: len(urdf.chain(joint.child))):
@@ -247,6 +258,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], 
             {
                 "parent": number[joint.parent],
                 "placement": _matrix(Placement(np.array(joint.xyz), kinematics.origins[joint.name])),
+                "quat": quaternions(kinematics.origins[joint.name]).tolist(),
                 "axis": joint.axis,
                 "prismatic": joint.prismatic,
                 "column": -1 if column is None else column,

@@ -10,6 +10,7 @@ Numbers are aligned to their size, relative to the end of the first 4 bytes. Sou
 """
 
 import struct
+from base64 import b64encode
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -43,10 +44,10 @@ class MixtureError(Exception):
 class Layout:
     """Layout of serialised messages that differ only in stamps and numbers, like the messages of a run.
 
-    Its parts, in their order, are stamps, texts, lengths of sequences, and numbers.
+    Its parts, in their order, are stamps, texts, lengths of sequences, constant numbers, and numbers.
     """
 
-    def __init__(self, *parts: Stamp | str | int | Numbers) -> None:
+    def __init__(self, *parts: Stamp | str | int | Array | Numbers) -> None:
         content = LITTLE_ENDIAN
         self._stamps: list[int] = []
         self._numbers: list[slice] = []
@@ -55,6 +56,9 @@ class Layout:
                 content += bytes(_gap(8, len(content)) if part.size else 0)
                 self._numbers.append(slice(len(content), len(content) + 8 * part.size))
                 content += bytes(8 * part.size)
+                continue
+            if isinstance(part, np.ndarray):
+                content += bytes(_gap(8, len(content))) + part.astype("<f8").tobytes()
                 continue
             content += bytes(_gap(4, len(content)))
             if isinstance(part, Stamp):
@@ -74,6 +78,11 @@ class Layout:
     def size(self) -> int:
         """Bytes of a message."""
         return len(self._plain)
+
+    def template(self) -> dict[str, object]:
+        """Return the message with zeros for stamps and numbers, in base64, and the offsets of each stamp and number."""
+        numbers = [at for where in self._numbers for at in range(where.start, where.stop, 8)]
+        return {"plain": b64encode(self._plain.tobytes()).decode(), "stamps": self._stamps, "numbers": numbers}
 
     def pack(self, stamps: ArrayLike, *numbers: Array) -> Rows:
         """Pack N messages with their stamps, ns, and numbers, N × count each."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,7 +22,7 @@ from ..simulation.experiments import NANOSECONDS, Experiment
 from ..simulation.input_values import Value
 from ..simulation.judge import OUTPUTS
 from ..simulation.sample import Sample
-from .cdr import Layout, Numbers, Rows, Stamp, joint_state_layout
+from .cdr import Array, Layout, Numbers, Rows, Stamp, joint_state_layout
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -273,15 +273,22 @@ class Messages:
 
         ``stamp`` is their time stamp, ns since the epoch.
         """
-        names = Layout(Stamp(), "", len(self._signals), *self._signals, self._version).pack(np.array([stamp]))
-        named = {SIGNAL_NAMES: names} if self._signals else {}
-        if self._scene is None:
-            return named
-        fixed = self._scene.transforms(self._scene.fixed, np.empty((1, 0)))
-        return named | {
-            "/robot_description": Layout(self._scene.description).pack([0]),
-            "/tf_static": _tf_layout(self._scene.fixed).pack(np.array([stamp]), *fixed),
-        }
+        return {topic: layout.pack(np.array([stamp])) for topic, layout in self._latched_layouts().items()}
+
+    def templates(self) -> dict[str, dict[str, object]]:
+        """Return the templates of all messages by topic, those that hold for the whole run first."""
+        layouts = self._latched_layouts() | self._layouts
+        return {topic: layout.template() for topic, layout in layouts.items()}
+
+    def _latched_layouts(self) -> dict[str, Layout]:
+        layouts: dict[str, Layout] = {}
+        if self._signals:
+            layouts[SIGNAL_NAMES] = Layout(Stamp(), "", len(self._signals), *self._signals, self._version)
+        if self._scene is not None:
+            fixed = self._scene.transforms(self._scene.fixed, np.empty((1, 0)))
+            layouts["/robot_description"] = Layout(self._scene.description)
+            layouts["/tf_static"] = _tf_layout(self._scene.fixed, [pose[0] for pose in fixed])
+        return layouts
 
 
 def _load_scene(run: Experiment, meshes_in: str) -> Scene:
@@ -296,9 +303,9 @@ def _load_scene(run: Experiment, meshes_in: str) -> Scene:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
 
 
-def _tf_layout(joints: Iterable[Joint]) -> Layout:
-    """Return the layout of a TFMessage: a transform for each joint, from parent to child link."""
-    parts: list[Stamp | str | Numbers] = []
-    for joint in joints:
-        parts += (Stamp(), joint.parent, joint.child, Numbers(7))
-    return Layout(len(parts) // 4, *parts)
+def _tf_layout(joints: Sequence[Joint], poses: Sequence[Array] | None = None) -> Layout:
+    """Return the layout of a TFMessage: a transform for each joint, from parent to child link; constant with poses."""
+    parts: list[Stamp | str | Array | Numbers] = []
+    for k, joint in enumerate(joints):
+        parts += (Stamp(), joint.parent, joint.child, Numbers(7) if poses is None else poses[k])
+    return Layout(len(joints), *parts)
