@@ -6,6 +6,7 @@ import json
 import re
 import tracemalloc
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,10 +19,12 @@ from motions import assert_true, bag_of, move, mujoco_model, noisy
 import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
-from twodof.identification import stretches
+from twodof.identification import fitting, parameters, stretches
 from twodof.identification.estimate import Misfit, Suspect, estimate
 from twodof.identification.fitting import read_model
+from twodof.identification.inertials import dynamic_parameters
 from twodof.identification.regression import modelled, rows_of
+from twodof.plant.urdf import read_urdf
 
 ARM = Path(__file__).parents[1] / "urdf" / "2dof.urdf"
 GRAVITY = (0.0, -9.81, 0.0)
@@ -107,6 +110,31 @@ def test_rows_have_columns_of_the_links_that_vary_alone(bag, free, columns):
     for few, all_rows in zip(*(rows_of(each, values, fitted, 0.0, True) for each in (some, whole))):
         assert (few.Y.shape[1], all_rows.Y.shape[1]) == (columns + 1, 21)
         np.testing.assert_allclose(modelled(few, values), modelled(all_rows, values), atol=1e-12)
+
+
+def test_a_derivative_recomputes_the_changed_link_alone(monkeypatch):
+    """A robot may have 1000 links; the derivatives are those of all values by central differences."""
+    free = ["mass:*", "com:*", "inertia:*", "payload", "payload_com", "gravity", "friction[*]", "offset:*", "gain:*"]
+    own = read_model(ARM, free, frame="EndEffector").parameters(GRAVITY)
+    x = own.coordinates({"friction": np.ones(2)})[0] + 0.1
+    calls = count()
+    monkeypatch.setattr(parameters, "dynamic_parameters", lambda *a: (next(calls), dynamic_parameters(*a))[1])
+    reported, rates = own.rates(x)
+    assert next(calls) <= len(x) + len(own.links) + 1
+    for k, step in enumerate(1e-6 * np.eye(len(x))):
+        up, down = own.values(x + step), own.values(x - step)
+        np.testing.assert_allclose(reported[:, k], (own.reported(up) - own.reported(down)) / 2e-6, atol=1e-7)
+        for rate, a, b in zip(rates, own.dynamics(up), own.dynamics(down)):
+            np.testing.assert_allclose(rate[..., k], (a - b) / 2e-6, atol=1e-7)
+
+
+def test_a_urdf_that_cannot_be_written_is_refused_before_the_fit(bag, monkeypatch, tmp_path):
+    monkeypatch.setattr(fitting, "estimate", None)
+    robot = tmp_path / "robot.urdf"
+    robot.write_text(ARM.read_text("utf-8").replace("<robot ", '<robot xmlns:x="a b" '), "utf-8")
+    read_urdf(robot.read_text("utf-8"))
+    with pytest.raises(InputError, match="the URDF cannot be written with fitted values: xmlns:x: 'a b' is not a "):
+        twodof.fit(robot, bag, FREE, gravity=GRAVITY)
 
 
 def test_only_numbers_of_the_urdf_change(bag):
@@ -325,6 +353,28 @@ def test_damping_of_a_robot_of_one_joint_is_found(tmp_path):
     assert np.ptp(np.diff(wrapped, axis=0)) > 6.0
     bag = bag_of(tmp_path / "wrapped", ["hub"], wrapped, 0.1 * a + 0.3 * v)
     assert twodof.fit(urdf, bag, "damping[*]").parameters[0].after == pytest.approx(0.3, abs=1e-3)
+
+
+def test_a_recording_of_a_very_high_rate_is_reduced_to_the_band():
+    t = 1e-5 * np.arange(400_000) + 0.1
+    q, tau = np.sin(3.0 * t)[:, None], np.cos(3.0 * t)[:, None]
+    recording: Any = SimpleNamespace(t=t, q=q, tau=tau, joints=("j",), path="fast")
+    robot: Any = SimpleNamespace(joints=("j",), prismatic=(True,), q_min=(-2.0,), q_max=(2.0,))
+    fitted, _ = stretches.stretches([recording], robot)
+    assert fitted[0].step == pytest.approx(1.0 / stretches.MOST_RATE)
+    assert sum(len(each.t) for each in fitted) == pytest.approx(2000 * (0.8 * 4.0 - stretches.EDGE), abs=250)
+    for each in fitted:
+        np.testing.assert_allclose(each.v[:, 0], 3.0 * np.cos(3.0 * each.t), atol=2e-3)
+        np.testing.assert_allclose(each.tau[:, 0], np.cos(3.0 * each.t), atol=1e-6)
+
+
+def test_samples_near_rest_are_found_whatever_the_window() -> None:
+    moving = np.random.default_rng(1).random((60, 2)) > 0.1
+    for reach in (0, 1, 3, 100):
+        near = [moving[max(0, k - reach) : k + reach + 1].all(axis=0) for k in range(len(moving))]
+        np.testing.assert_array_equal(stretches._eroded(moving, reach), near)
+    assert stretches._eroded(moving[:0], 3).shape == (0, 2)
+    assert not stretches._eroded(moving, 10**13).any()  # a window of this size does not fit into memory
 
 
 def test_one_of_millions_of_wrong_values_is_named_without_a_list_of_all() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import lxml.etree
 import numpy as np
 
+from ..errors import InputError
 from ..plant.robot import inertial_place
 from ..plant.urdf import INERTIA, Urdf
 from .inertials import inertia_of
@@ -30,8 +31,7 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
         parameters: the free parameters.
         values: values of all parameters.
     """
-    parser = lxml.etree.XMLParser(encoding="utf-8", resolve_entities=False, no_network=True, huge_tree=False)
-    tree = lxml.etree.parse(io.BytesIO(text.encode()), parser)
+    tree = parsed(text)
     root = tree.getroot()
     links = {link.get("name"): link for link in root.findall("link")}
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
@@ -49,6 +49,19 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
     declaration = re.match(r"\ufeff?<\?xml.*?\?>\s*", text, re.DOTALL)
     written = lxml.etree.tostring(tree, encoding="unicode")
     return f"{declaration[0] if declaration else ''}{written.rstrip()}\n".encode()
+
+
+def parsed(text: str) -> Any:
+    """Return the tree of a URDF, in which numbers can be replaced.
+
+    Raises:
+        InputError: libxml2 refuses the text; expat, which reads robots, accepts a little more.
+    """
+    parser = lxml.etree.XMLParser(encoding="utf-8", resolve_entities=False, no_network=True, huge_tree=False)
+    try:
+        return lxml.etree.parse(io.BytesIO(text.encode()), parser)
+    except lxml.etree.XMLSyntaxError as error:
+        raise InputError(f"the URDF cannot be written with fitted values: {error.msg}") from error
 
 
 def _write_link(inertial: Any, group: str, link: int, values: Values) -> None:

@@ -22,7 +22,7 @@ from .commanded import commanded_efforts
 from .curves import Comparison, compare
 from .estimate import PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
-from .fitted_urdf import fitted_urdf
+from .fitted_urdf import fitted_urdf, parsed
 from .parameters import Dynamics, Parameters
 from .regression import regressors
 from .stretches import Array, Stretch, jumps, stretches
@@ -122,6 +122,7 @@ def fit(
     if output is not None:
         check_folder(output)
     model, gravity = read_model(urdf, free, **options), options.get("gravity")
+    parsed(model.text)  # so that a URDF that cannot be written is refused before the computation
     recordings = _recordings(bags)
     parameters = model.parameters(_recorded_gravity(recordings) if gravity is None else tuple(gravity))
     fitted, held = stretches(recordings, model.robot)

@@ -272,60 +272,77 @@ class Parameters:
         """Return the physical values at coordinates, which may be complex for derivatives."""
         values, place = self.start.copy(x.dtype.type), 0
         for free in self.free:
-            part, own = x[place : place + free.size], free.of(values)
+            self._set(free, free.of(values), x[place : place + free.size])
             place += free.size
-            if free.group in EXPONENTS:
-                own[...] = np.exp(part[0])
-            elif free.group == "inertia":
-                factor = np.zeros((3, 3), x.dtype)
-                factor[ROWS, COLUMNS] = part
-                factor[range(3), range(3)] = np.exp(np.diag(factor))
-                own[:] = factor @ factor.T
-            elif free.group == "gravity":
-                g = self.start.gravity
-                axes = np.linalg.svd(g[None])[2][1:]
-                length = np.linalg.norm(g)
-                own[:] = (g + length * (part @ axes)) / np.sqrt(1.0 + part @ part)
-            else:
-                own[...] = part if own.ndim else part[0]
         return values
+
+    def _set(self, free: Free, own: NDArray[Any], part: NDArray[Any]) -> None:
+        """Set the values of a parameter from its coordinates."""
+        if free.group in EXPONENTS:
+            own[...] = np.exp(part[0])
+        elif free.group == "inertia":
+            factor = np.zeros((3, 3), part.dtype)
+            factor[ROWS, COLUMNS] = part
+            factor[range(3), range(3)] = np.exp(np.diag(factor))
+            own[:] = factor @ factor.T
+        elif free.group == "gravity":
+            g = self.start.gravity
+            axes = np.linalg.svd(g[None])[2][1:]
+            length = np.linalg.norm(g)
+            own[:] = (g + length * (part @ axes)) / np.sqrt(1.0 + part @ part)
+        else:
+            own[...] = part if own.ndim else part[0]
 
     def reported(self, values: Values) -> NDArray[Any]:
         """Return the values of the named parameters."""
-        numbers: list[Any] = []
-        for free in self.free:
-            own = free.of(values)
-            numbers += [inertia_of(own)[place] for place in INERTIA.values()] if own.ndim == 2 else [*own.flat]
-        return np.array(numbers)
+        return np.concatenate([_reported(free.of(values)) for free in self.free])
 
     def dynamics(self, values: Values) -> Dynamics:
         """Return the parameters of inverse dynamics for given values."""
-        others = (getattr(values, field) for field in Dynamics._fields[1:])
-        return Dynamics(self._inertial(values), *others)
-
-    def _inertial(self, values: Values) -> NDArray[Any]:
         out = np.zeros(10 * (self.robot.model.njoints - 1), values.mass.dtype)
-        for link, (body, place) in enumerate(zip(self.bodies, self.places)):
-            out[10 * body : 10 * body + 10] += dynamic_parameters(
-                values.mass[link], values.com[link], values.second[link], place.rotation, place.translation
-            )
-        body, place = self._end
-        if body >= 0:
-            none = np.zeros((3, 3))
-            end = dynamic_parameters(values.payload[0], values.payload_com, none, place.rotation, place.translation)
-            out[10 * body : 10 * body + 10] += end
-        return out
+        for link in (*range(len(self.links)), None):
+            body, ten = self._ten(values, link)
+            if body >= 0:
+                out[10 * body : 10 * body + 10] += ten
+        return Dynamics(out, *(getattr(values, field) for field in Dynamics._fields[1:]))
+
+    def _ten(self, values: Values, link: int | None) -> tuple[int, NDArray[Any]]:
+        """Return the body and the ten dynamic parameters of a link, or of the payload, in the frame of its joint."""
+        if link is None:
+            (body, place), own = self._end, (values.payload[0], values.payload_com, np.zeros((3, 3)))
+        else:
+            body, place = self.bodies[link], self.places[link]
+            own = values.mass[link], values.com[link], values.second[link]
+        return body, dynamic_parameters(*own, place.rotation, place.translation)
 
     def rates(self, x: Array) -> tuple[Array, Dynamics]:
-        """Return the exact derivatives of reported values and dynamics in the coordinates, by complex steps."""
-        step, columns = 1e-30, []
-        for k in range(len(x)):
-            moved = x.astype(complex)
-            moved[k] += 1j * step
-            values = self.values(moved)
-            columns.append([self.reported(values), *self.dynamics(values)])
-        reported, *rest = (np.stack(each, -1).imag / step for each in zip(*columns))
-        return reported, Dynamics(*rest)
+        """Return the exact derivatives of reported values and dynamics in the coordinates, by complex steps.
+
+        A step changes the numbers of one parameter alone, and so only these are computed: a robot may have 1000 links.
+        """
+        step, values, column, row = 1e-30, self.values(x.astype(complex)), 0, 0
+        rates = Dynamics(*(np.zeros((*each.shape, len(x))) for each in self.dynamics(self.start)))
+        reported = np.zeros((len(self.names), len(x)))
+        for free in self.free:
+            own, rows, columns = free.of(values), len(free.names), slice(column, column + free.size)
+            before = own.copy()
+            for part, k in zip(x[columns] + 1j * step * np.eye(free.size), range(column, columns.stop)):
+                self._set(free, own, part)
+                reported[row : row + rows, k] = _reported(own).imag / step
+                if free.group in Dynamics._fields:
+                    getattr(rates, free.group)[..., k] = getattr(values, free.group).imag / step
+                    continue
+                body, ten = self._ten(values, None if free.group in OF_THE_ROBOT else free.place)
+                if body >= 0:
+                    rates.inertial[10 * body : 10 * body + 10, k] = ten.imag / step
+            own[...] = before
+            column, row = columns.stop, row + rows
+        return reported, rates
+
+
+def _reported(own: NDArray[Any]) -> NDArray[Any]:
+    """Return the named values of a parameter; of second moments of mass, those of the inertia."""
+    return np.array([inertia_of(own)[place] for place in INERTIA.values()]) if own.ndim == 2 else own.ravel()
 
 
 def _of_all(free: Free) -> str:

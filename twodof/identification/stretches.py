@@ -38,6 +38,7 @@ MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint 
 SPIKES = 0.01  # largest fraction of samples that are spikes
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
+MOST_RATE = 100.0 * MOST_BAND  # Hz: means of as many samples as keep this rate replace those of a far higher one
 MIXED = 0.03  # second difference of positions between close samples, as part of their range, that shows mixed samples
 WRAP = 0.1  # part of a turn by which a step without its whole turn may differ from the step before it
 MOST_FITTED, MOST_HELD = 100_000, 6000
@@ -114,12 +115,12 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
         whole = [(a, b) for a, b in pairwise(cuts) if t[b - 1] - t[a] >= SHORTEST]
         if not whole:
             raise InputError(f"'{name}' is too short: a fit needs {SHORTEST:g} s without a gap")
-        end = t[-1] * (1.0 - HELD_OUT)
+        end, many = t[-1] * (1.0 - HELD_OUT), max(1, int(1.0 / (MOST_RATE * h) + 1e-6))
         for a, b in whole:
-            stretch = _smooth(bag, t[a:b], q[a:b], tau[a:b], h)
+            stretch = _smooth(bag, _means(t[a:b], many), _means(q[a:b], many), _means(tau[a:b], many), many * h)
             split = int(np.searchsorted(stretch.t, end))
             for part, into in ((stretch.part(slice(split)), fitted), (stretch.part(slice(split, None)), held)):
-                if len(part.t) * h >= 0.5 * SHORTEST:
+                if len(part.t) * many * h >= 0.5 * SHORTEST:
                     into.append(part)
     if not fitted:
         raise InputError("the recordings are too short to hold a fifth out")
@@ -294,8 +295,14 @@ def _resampled(t: Array, tau: Array, way: Array, grid: Array, own: Array) -> Arr
     return out
 
 
+def _means(values: Array, many: int) -> Array:
+    """Return the means of each ``many`` consecutive samples."""
+    used = len(values) // many * many
+    return np.asarray(values[:used].reshape(-1, many, *values.shape[1:]).mean(axis=1)) if many > 1 else values
+
+
 def _eroded(moving: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     """Return True for samples whose neighbours within ``reach`` all move in the same direction."""
-    from scipy.ndimage import binary_erosion
-
-    return np.asarray(binary_erosion(moving, np.ones((2 * reach + 1, 1)), border_value=1))
+    rests = np.pad(np.cumsum(~moving, axis=0), ((1, 0), (0, 0)))  # before each sample
+    k = np.arange(len(moving))
+    return np.asarray(rests[np.minimum(k + reach + 1, len(k))] == rests[np.maximum(k - reach, 0)])
