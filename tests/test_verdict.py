@@ -12,6 +12,7 @@ import failures
 import numpy as np
 import pytest
 from failures import FAILURES, ROBOTS, Failure, fmu_of, good_runs
+from numpy.typing import ArrayLike
 from page_causes import page_causes
 from recordings import third_party_bag
 from scipy.optimize import brute, differential_evolution
@@ -20,9 +21,10 @@ from sinks import Memory
 
 import twodof
 from twodof.cli.main import main
-from twodof.geometry.kinematics import Kinematics
+from twodof.geometry import reach
+from twodof.geometry.kinematics import Kinematics, Placement
 from twodof.geometry.reach import nearest
-from twodof.plant.urdf import read_urdf
+from twodof.plant.urdf import Joint, read_urdf
 from twodof.simulation import stepping
 from twodof.simulation.cause import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
@@ -342,6 +344,33 @@ def test_the_nearest_point_of_a_panda_is_that_of_an_evolution() -> None:
 
 
 # --- what it costs ---
+
+
+class Counted(Kinematics):
+    """Kinematics that count transforms of single joints."""
+
+    count = 0
+
+    def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
+        self.count += 1
+        return super().in_parent(joint, q)
+
+
+def test_the_search_for_the_nearest_point_of_a_long_chain_has_a_bound() -> None:
+    moving, still = 64, 400
+    text = '<robot name="c"><link name="l0"/>'
+    for i in range(1, moving + still + 1):
+        kind = "continuous" if i <= moving else "fixed"
+        text += f'<link name="l{i}"/><joint name="j{i}" type="{kind}"><parent link="l{i - 1}"/><child link="l{i}"/>'
+        text += f'<origin xyz="0.1 0 0.01"/><axis xyz="0 {i % 2} {1 - i % 2}"/></joint>'
+    kinematics = Counted(read_urdf(text + "</robot>"), [f"j{i}" for i in range(1, moving + 1)])
+    target, free, none = np.array([100.0, 3.0, 1.0]), np.full(moving, np.inf), np.empty(0)
+    end = kinematics.end(f"l{moving + still}", np.zeros((1, moving))).translation[0]
+    np.testing.assert_allclose(end, [0.1 * (moving + still), 0.0, 0.01 * (moving + still)])
+    search = {"axes": (0, 1, 2), "target": target, "quat": none, "low": -free, "high": free}
+    found = nearest(kinematics, f"l{moving + still}", q=np.full(moving, 0.1), **search)
+    assert found.distance < np.linalg.norm(target - end) + 1.0
+    assert kinematics.count < still + 2 * reach.MOST_TURNS + 5 * moving
 
 
 def test_the_verdict_calls_no_function_for_each_sample(native_path: Path) -> None:

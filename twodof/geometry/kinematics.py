@@ -74,6 +74,7 @@ class Kinematics:
         self.urdf = urdf
         self._columns = {name: i for i, name in enumerate(joints)}
         self.origins = {joint.name: Rotation.from_euler("xyz", joint.rpy).as_matrix() for joint in urdf.joints.values()}
+        self._parts: dict[str, tuple[list[tuple[Placement, Joint]], Placement]] = {}
 
     def body(self, link: str) -> Body:
         """Return the inertia of a link; zeros if the URDF has none."""
@@ -136,16 +137,31 @@ class Kinematics:
             here = here * self.in_parent(joint, q)
             yield here
 
-    def end(self, chain: Iterable[Joint], q: ArrayLike) -> Placement:
-        """Return the transforms of the last child of a chain from the root; joints at rest are composed once."""
+    def end(self, link: str, q: ArrayLike) -> Placement:
+        """Return the transforms of a link from the root at N samples."""
         q = np.asarray(q, dtype=np.float64)
         here = Placement(np.zeros((len(q), 3)), np.tile(np.eye(3), (len(q), 1, 1)))
-        rest = still = Placement(np.zeros((1, 3)), np.eye(3)[None])
-        for joint in chain:
-            rest = rest * self.in_parent(joint, q)
-            if self.moves(joint):
-                here, rest = here * rest, still
-        return here * rest
+        parts, last = self.parts(link)
+        for before, joint in parts:
+            here = here * (before * self.in_parent(joint, q))
+        return here * last
+
+    def parts(self, link: str) -> tuple[list[tuple[Placement, Joint]], Placement]:
+        """Return the moving joints above a link, each with the transform before it, and the transform after the last.
+
+        Joints at rest are composed once for each link.
+        """
+        if link not in self._parts:
+            parts, still = list[tuple[Placement, Joint]](), Placement(np.zeros((1, 3)), np.eye(3)[None])
+            rest = still
+            for joint in self.urdf.chain(link):
+                if self.moves(joint):
+                    parts.append((rest, joint))
+                    rest = still
+                else:
+                    rest = rest * self.in_parent(joint, ())
+            self._parts[link] = parts, rest
+        return self._parts[link]
 
     def path(self, link: str, q: ArrayLike) -> Array:
         """Return positions of a link's origin in the root frame, N × 3, m."""
@@ -174,20 +190,22 @@ class Kinematics:
 
     def jacobian(self, link: str, q: ArrayLike) -> Array:
         """Return the Jacobian of the link in the root's axes, N × 6 × joints: linear, then angular rows."""
-        chain = self.urdf.chain(link)
-        transforms = [*self.along(chain, q)]
-        end = transforms[-1].translation
-        jacobian = np.zeros((len(end), 6, len(self._columns)))
-        for joint, transform in zip(chain, transforms[1:]):
+        q = np.asarray(q, dtype=np.float64)
+        parts, last = self.parts(link)
+        transforms = [Placement(np.zeros((len(q), 3)), np.tile(np.eye(3), (len(q), 1, 1)))]
+        for before, joint in parts:
+            transforms.append(transforms[-1] * (before * self.in_parent(joint, q)))
+        end = (transforms[-1] * last).translation
+        jacobian = np.zeros((len(q), 6, len(self._columns)))
+        for (_, joint), transform in zip(parts, transforms[1:]):
             column, ratio, _ = self.column(joint)
-            if column is not None:
-                axis = ratio * rotated(transform.rotation, joint.axis)
-                arm = end - transform.translation
-                if joint.prismatic:
-                    jacobian[:, :3, column] += axis
-                else:
-                    jacobian[:, :3, column] += np.cross(axis, arm)
-                    jacobian[:, 3:, column] += axis
+            axis = ratio * rotated(transform.rotation, joint.axis)
+            arm = end - transform.translation
+            if joint.prismatic:
+                jacobian[:, :3, column] += axis
+            else:
+                jacobian[:, :3, column] += np.cross(axis, arm)
+                jacobian[:, 3:, column] += axis
         return jacobian
 
 

@@ -19,6 +19,7 @@ from .kinematics import Array, Kinematics
 
 SCATTERED, IMPROVED = 2000, 6  # starts, and those of them that are improved
 MOST_STEPS = 100  # of each start; robots of many joints converge slowly to poses out of reach
+MOST_TURNS = 5000  # evaluated joints of all starts: fewer steps and starts of a robot of more than 7 joints
 LONGEST = 10.0  # m: range of starts for a prismatic joint without limits
 LOCKED = 1e-9  # rad or m: least range of a joint that the solver accepts
 PRECISE = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13)
@@ -57,15 +58,13 @@ def nearest(
         q: first start, rad or m.
     """
     wanted = Rotation.from_quat(quat) if quat.size else None
-    chain, rows = kinematics.urdf.chain(link), [*axes, *((3, 4, 5) if wanted else ())]
+    rows, joints = [*axes, *((3, 4, 5) if wanted else ())], [joint for _, joint in kinematics.parts(link)[0]]
     sliding = np.zeros(len(q), bool)
-    for joint in chain:
-        column = kinematics.column(joint)[0]
-        if column is not None:
-            sliding[column] = joint.prismatic
+    for joint in joints:
+        sliding[kinematics.column(joint)[0]] = joint.prismatic
 
     def residual(at: Array) -> Array:
-        end = kinematics.end(chain, at[None])
+        end = kinematics.end(link, at[None])
         off = end.translation[0][list(axes)] - target
         if wanted is None:
             return np.asarray(off)
@@ -78,19 +77,20 @@ def nearest(
     half = np.where(sliding, LONGEST, pi)
     ends = np.where(np.isfinite(low), low, q - half), np.where(np.isfinite(high), high, q + half)
     starts = np.random.default_rng(0).uniform(*ends, (SCATTERED, len(q)))
-    scattered = kinematics.end(chain, starts)
+    scattered = kinematics.end(link, starts)
     far = np.linalg.norm(scattered.translation[:, list(axes)] - target, axis=1)
     if wanted:
         far = np.hypot(far, (Rotation.from_matrix(scattered.rotation) * wanted.inv()).magnitude())
-    found = []
+    found, left = [], MOST_TURNS // max(1, len(joints))
     width = high - low
     margin = 1e-12 * (1 + np.where(np.isfinite(width), width, 0))  # the solver must start inside the limits
     for start in [q, *starts[np.argsort(far)[:IMPROVED]]]:
         inside = np.clip(start, low + margin, high - margin)
-        found.append(least_squares(residual, inside, slope, (low, high), max_nfev=MOST_STEPS, **PRECISE))
-        if found[-1].cost < 0.5 * EXACT**2:
+        found.append(least_squares(residual, inside, slope, (low, high), max_nfev=min(MOST_STEPS, left), **PRECISE))
+        left -= found[-1].nfev
+        if found[-1].cost < 0.5 * EXACT**2 or left < 1:
             break
     best = min(found, key=lambda each: each.cost)
-    end, off = kinematics.end(chain, best.x[None]), residual(best.x)
+    end, off = kinematics.end(link, best.x[None]), residual(best.x)
     distance, angle = (float(np.linalg.norm(part)) for part in np.split(off, [len(axes)]))
     return Nearest(best.x, end.translation[0], distance, angle)

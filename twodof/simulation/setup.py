@@ -88,9 +88,8 @@ class Setup(NamedTuple):
         """Return orientations of the end effector at N samples, quaternions x, y, z, w, N × 4."""
         from ..geometry.kinematics import BLOCK, quaternions
 
-        kinematics = self.kinematics
-        chain, blocks = kinematics.urdf.chain(self.frame), (q[k : k + BLOCK] for k in range(0, len(q), BLOCK))
-        return np.concatenate([quaternions(kinematics.end(chain, block).rotation) for block in blocks])
+        kinematics, blocks = self.kinematics, (q[k : k + BLOCK] for k in range(0, len(q), BLOCK))
+        return np.concatenate([quaternions(kinematics.end(self.frame, block).rotation) for block in blocks])
 
 
 def limits_of(robot: Urdf | None, names: Sequence[str]) -> Limits:
