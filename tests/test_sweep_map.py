@@ -1,6 +1,7 @@
 """The content of a sweep's map, and the report of its best runs."""
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 from tables import SMALL, table_of
 
 from twodof import read_bag, sweep
+from twodof.bag.recording import Recording
 from twodof.cli.main import main
 from twodof.plots import maps
 from twodof.plots.figure import drawn, save
@@ -162,6 +164,18 @@ POINT = """run => {
     return [box.x + xaxis._offset + xaxis.d2p(x[run]), box.y + yaxis._offset + yaxis.d2p(y[run])];
 }"""
 """Place of a run in the first map, in pixels of the window."""
+
+
+def test_a_page_judges_no_run(native_path, tmp_path, monkeypatch):
+    """Thousands of killed runs have no stored verdict."""
+    folder = tmp_path / "s"
+    sweep(native_path, grid={"Kp": [20, 60]}, stop_time=0.1, output=folder, bags=True)
+    run = folder / "bags" / "000001" / "run.json"
+    run.write_text(json.dumps({name: v for name, v in json.loads(run.read_text()).items() if name != "verdict"}))
+    monkeypatch.setattr(Recording, "_judged", None)
+    curves = maps._curves(read_sweep(folder), folder / "bags")
+    assert [bool(curves[run]["verdict"]) for run in ("0", "1")] == [True, False]
+    assert curves["1"]["lines"]
 
 
 def test_a_click_in_the_map_opens_the_runs_curves(native_path, tmp_path):
