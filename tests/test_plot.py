@@ -343,6 +343,16 @@ def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(joints, control
     assert re.match(rf"not reached: \S+ m from the target \(0.3, 0.3\) m{angle}; ", outcome(track)[0])
 
 
+def test_very_many_changes_of_inputs_have_no_closed_form(changing, monkeypatch):
+    before = read_tracks([changing.bag])[0].task
+    assert before is not None and before.closed_form is not None
+    monkeypatch.setattr("twodof.plots.track.MOST_HELD", 2)
+    monkeypatch.setattr("twodof.plots.track.task_error", None)
+    task = read_tracks([changing.bag])[0].task
+    assert task is not None and task.closed_form is None
+    np.testing.assert_array_equal(task.error, before.error)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("gains", [(0.0, 40.0), (0.0, 0.0), (50.0, 0.0)])
 def test_a_controller_without_a_gain_is_drawn(gains, fmu_path, tmp_path):
