@@ -270,6 +270,7 @@ def test_messages_that_cannot_be_followed(arm, tmp_path, capfd, message, reason)
     ("after", "there", "step", "reason"),
     [
         (2e9, THERE, "0.01", "its trajectories take 2e+09 s, more than 1000000 steps of 0.01 s"),
+        (9000.0, THERE, "0.01", "take 9000 s, and those of 2 joints can take 7142.85 s at steps of 0.01 s"),
         (1.0, THERE, "0", "more than 1000000 steps of 0 s"),
         (1e-9, ((1e300, 0.0), (0.0, 0.0), (0.0, 0.0)), "0.01", "is not finite"),
     ],

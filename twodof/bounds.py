@@ -61,6 +61,7 @@ MAX_COMMANDS = 1_000_000  # messages of a bag
 MAX_COMMAND = 64 * KIB  # a message; some thousand joints, read within milliseconds
 MAX_COMMANDS_SIZE = 384 * MIB  # all of these messages, and what they take in memory
 MAX_POINTS = 250_000  # of all trajectories in a bag, each of which takes 40 µs
+MAX_FOLLOWED = 10_000_000  # inputs of all steps of trajectories, each of which counts CHANGE more; 600 MiB
 MAX_TRAJECTORY = 4 * MIB  # a message; some ten thousand points, read within a second
 
 # bags

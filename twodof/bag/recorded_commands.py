@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..bounds import MAX_COMMANDS, MAX_COMMANDS_SIZE, MAX_POINTS, MIB
+from ..bounds import CHANGE, MAX_COMMANDS, MAX_COMMANDS_SIZE, MAX_FOLLOWED, MAX_POINTS, MIB
 from ..errors import BagError, InputError
 from ..files import shown
 from ..fmu import Fmu, load_fmu
@@ -168,6 +168,12 @@ def _followed(commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value]
     if not ended - begun <= MAX_COMMANDS * step < inf:
         most = f"{MAX_COMMANDS} steps of {step:g} s"
         raise InputError(f"{bag}: its trajectories take {ended - begun:g} s, more than {most}")
+    inputs = len(FOLLOWING) * len({i for it in trajectories for i in it.joints})
+    if ended - begun > (longest := MAX_FOLLOWED // (inputs + CHANGE) * step):
+        raise InputError(
+            f"{bag}: its trajectories take {ended - begun:g} s, and those of {inputs // len(FOLLOWING)} joints can take"
+            f" {longest:g} s at steps of {step:g} s; cut it into several bags, or use longer steps"
+        )
     grid = step * np.arange(floor(begun / step) - 1.0, floor(ended / step) + 3.0)
     groups = [fmu.vector(group) for group in FOLLOWING]
     starts = fmu.vector("q_start")
