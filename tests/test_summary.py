@@ -3,6 +3,7 @@
 import random
 import shutil
 import struct
+from contextlib import nullcontext
 from pathlib import Path
 from zlib import crc32
 
@@ -16,8 +17,9 @@ import twodof
 from twodof.bag.contents import read_messages
 from twodof.bag.mcap import CHANNEL
 from twodof.bag.reader import read_ends
-from twodof.bag.records import ReadBudget
-from twodof.bag.summary import read_summary
+from twodof.bag.records import DamageError, ReadBudget
+from twodof.bag.summary import _chunk, read_summary
+from twodof.bounds import MAX_TOPICS
 from twodof.cli.main import main
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -126,6 +128,15 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
     content[place + 9 + field] ^= 1
     seal(file, content, start)
     assert read_summary(file) is None
+
+
+def test_a_chunk_index_has_no_more_channels_than_a_file():
+    """Each takes memory before any of them is checked."""
+    for channels, valid in ((MAX_TOPICS, True), (MAX_TOPICS + 1, False)):
+        offsets = b"".join(struct.pack("<HQ", n, 100 + 15 * n) for n in range(channels))
+        record = struct.pack("<QQQQI", 0, 1, 50, 50, len(offsets)) + offsets + struct.pack("<Q", 15 * channels)
+        with nullcontext() if valid else pytest.raises(DamageError, match="damaged summary"):
+            assert len(_chunk(Path("a.mcap"), record).counts) == channels
 
 
 def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(bag):

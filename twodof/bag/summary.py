@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
 
-from ..bounds import MAX_SUMMARY
+from ..bounds import MAX_SUMMARY, MAX_TOPICS
 from .mcap import CHANNEL, CHUNK, FOOTER, HEAD, MAGIC, SCHEMA, Tables, messages_in, unpack_chunk
 from .records import Batch, Channel, DamageError, ReadBudget, refusing_damage
 
@@ -26,6 +26,7 @@ FOOTER_FIELDS = struct.Struct("<QQI")
 END = HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
 CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the offsets by channel
+OFFSET_SIZE = 10  # of the message index of one channel
 INDEX_SIZE = struct.Struct("<Q")  # of all message indexes of a chunk, which follow it
 INDEX_HEAD, INDEX_ENTRY = 15, 16  # bytes of a message index of one channel, besides those of each message
 
@@ -135,6 +136,8 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
 def _chunk(path: Path, record: bytes) -> Chunk:
     """Return a chunk from its index record; its message counts follow from the sizes of its message indexes."""
     first, last, offset, length, size = CHUNK_FIELDS.unpack_from(record)
+    if size > MAX_TOPICS * OFFSET_SIZE:
+        raise DamageError(f"'{path.name}' has a damaged summary")
     offsets = record[CHUNK_FIELDS.size : CHUNK_FIELDS.size + size]
     (index_size,) = INDEX_SIZE.unpack_from(record, CHUNK_FIELDS.size + size)
     begin = offset + length
