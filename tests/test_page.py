@@ -462,6 +462,42 @@ def test_keys_move_the_view_of_a_flat_robot(page) -> None:
     assert target_place(page)[0] == pytest.approx(ball_at[0] + 0.04 * before.shape[1], abs=2.0)
 
 
+def test_gains_have_a_slider_for_each_axis_on_demand(browser, arm, page) -> None:
+    every, own = "Kp, 1/s2", "Kp[2], 1/s2"
+    button = page.get_by_role("button", name="each element of Kp", exact=True)
+    assert not page.get_by_label(own).is_visible()
+    button.click()
+    page.get_by_label(own).fill("80")
+    page.keyboard.press("Enter")
+    assert page.evaluate("arm.held('Kp')") == [50, 80]
+    until(page, "#Kp=50,80".__eq__, fragment)
+    until(page, "".__eq__, lambda page: page.get_by_label(every).input_value())
+    assert button.is_disabled()  # gains that differ stay visible
+    with browser.new_context(viewport=VIEWPORT, offline=True) as context:
+        other = context.new_page()
+        other.goto(f"{arm.as_uri()}#Kp=50,80")
+        other.wait_for_selector(READY)
+        until(other, bool, lambda other: other.get_by_label(own).is_visible())
+        assert other.get_by_label(own).input_value() == "80"
+    page.get_by_label(every).fill("60")
+    page.keyboard.press("Enter")
+    assert page.evaluate("arm.held('Kp')") == [60, 60]
+    until(page, bool, lambda page: button.is_enabled())
+    button.click()
+    assert not page.get_by_label(own).is_visible()
+
+
+def test_the_axes_of_the_root_are_in_the_corner(page) -> None:
+    """x to the right and y upwards; z points at the viewer."""
+    for scheme in ("dark", "light"):
+        page.emulate_media(color_scheme=scheme)
+        red, green, blue = np.moveaxis(picture(page)[-100:, :100].astype(int), -1, 0)
+        x, y = (red - green > 50), (green - red > 30) & (green - blue > 20)
+        (height, width), (tall, narrow) = (np.ptp(np.argwhere(axis), axis=0) for axis in (x, y))
+        assert width > 25 > height and tall > 25 > narrow
+        assert not (blue - red > 60).any()
+
+
 def test_the_hint_goes_with_the_first_drag(browser, arm) -> None:
     with shown(browser, arm) as page:
         page.evaluate("() => { arm.play(false); arm.startAgain(true); }")

@@ -9,7 +9,8 @@ const GAINS = ["Kp", "Kd", "Kp_rot", "Kd_rot", "Kn"];
 const JOINTS = ["friction", "damping", "armature"];
 const SENSORS = ["q_resolution", "q_noise", "v_noise"];
 const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start", ...JOINTS, ...SENSORS];
-const PER_AXIS = ["x_des", "xd_des", "xdd_des"];
+const LAW = ["Kp", "Kd"]; // per axis, or per joint in joint-space control
+const PER_AXIS = ["x_des", "xd_des", "xdd_des", ...LAW];
 const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["target or command", true, ["x_des", "quat_des", "q_des", "tau_cmd"]],
   ["gains", true, GAINS],
@@ -31,8 +32,10 @@ export class Controls {
     this.reach = reach;
     this.onChange = onChange;
     this.names = shortNames(session.facts.joints);
-    /** @type {Map<string, HTMLInputElement[]>} */
-    this.fields = new Map();
+    /** @type {{names: string[], inputs: HTMLInputElement[]}[]} variables and the inputs that set all of them */
+    this.fields = [];
+    /** @type {{names: string[], button: HTMLButtonElement, open: (on: boolean) => void}[]} gains with sliders on demand */
+    this.gains = [];
     for (const [title, open, groups] of GROUPS) {
       const rows = groups.filter((group) => session.groups.has(group)).flatMap((group) => this.rows(group));
       if (!rows.length) continue;
@@ -42,18 +45,35 @@ export class Controls {
     }
   }
 
-  /** @type {(group: string) => HTMLElement[]} The sliders of a group: one for all gains, else one for each element. */
+  /** @type {(group: string) => HTMLElement[]} The sliders of a group, one for each element. */
   rows(group) {
     const names = /** @type {string[]} */ (this.session.groups.get(group));
-    if (GAINS.includes(group)) return [this.row(group, names[0])];
-    const rows = names.map((name) => this.row(name, name));
+    const rows = names.map((name) => this.row(name, [name]));
+    if (GAINS.includes(group) && names.length > 1) return [this.common(group, names, rows), ...rows];
     return PER_JOINT.includes(group) ? [element("div", group), ...rows] : rows;
   }
 
-  /** @type {(name: string, first: string) => HTMLElement} Row of a variable or group, with the value of its first
-   * element. */
-  row(name, first) {
-    const { session } = this, variable = session.variable(first);
+  /** A slider for all elements of a vector, with a button that shows their own. */
+  /** @type {(group: string, names: string[], rows: HTMLElement[]) => HTMLElement} */
+  common(group, names, rows) {
+    const button = document.createElement("button"), row = this.row(group, names);
+    const open = (/** @type {boolean} */ on) => {
+      button.textContent = on ? "▾" : "▸";
+      button.setAttribute("aria-expanded", String(on));
+      for (const own of rows) own.hidden = !on;
+    };
+    Object.assign(button, { type: "button", title: "a slider for each element" });
+    button.setAttribute("aria-label", `each element of ${group}`);
+    button.addEventListener("click", () => open(rows[0].hidden));
+    /** @type {HTMLElement} */ (row.firstChild).append(" ", button);
+    open(false);
+    this.gains.push({ names, button, open });
+    return row;
+  }
+
+  /** @type {(name: string, names: string[]) => HTMLElement} Row of a variable, or of a vector's elements together. */
+  row(name, names) {
+    const { session } = this, [first] = names, variable = session.variable(first);
     const value = session.values.get(first);
     const label = element("span", this.label(name)), [low, high] = this.range(name, Number(value));
     label.title = `${name}: ${variable.description}${variable.unit ? `, ${variable.unit}` : ""}`;
@@ -69,7 +89,7 @@ export class Controls {
       });
       return input;
     });
-    this.fields.set(first, inputs);
+    this.fields.push({ names, inputs });
     const row = element("label", "", label, ...inputs, element("small", unitText(variable.unit)));
     row.className = "slider";
     return row;
@@ -80,7 +100,7 @@ export class Controls {
     const [group, number] = name.replace("]", "").split("["), { axes } = this.session.facts;
     if (number === undefined) return name;
     const i = Number(number) - 1;
-    if (PER_JOINT.includes(group)) return this.names[i];
+    if (PER_JOINT.includes(group) || (LAW.includes(group) && this.session.groups.has("q_des"))) return this.names[i];
     return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
   }
 
@@ -107,12 +127,20 @@ export class Controls {
 
   /** Show the session's values, except in a field in which the user types. */
   show() {
-    for (const [name, inputs] of this.fields) {
-      const value = this.session.values.get(name);
+    const { values } = this.session;
+    /** @param {string[]} names */
+    const alike = (names) => names.every((name) => values.get(name) === values.get(names[0]));
+    for (const { names, button, open } of this.gains) {
+      button.disabled = !alike(names); // gains that differ stay visible
+      if (button.disabled) open(true);
+    }
+    for (const { names, inputs } of this.fields) {
+      const value = values.get(names[0]);
       for (const input of inputs) {
         if (input.type === "checkbox") input.checked = Boolean(value);
         else if (document.activeElement !== input || input.type === "range") {
-          const text = input.type === "range" ? String(value) : String(Number(Number(value).toFixed(6)));
+          const typed = alike(names) ? String(Number(Number(value).toFixed(6))) : "";
+          const text = input.type === "range" ? String(value) : typed;
           if (input.value !== text) input.value = text;
         }
       }

@@ -11,6 +11,12 @@ import { Scene } from "./scene.js";
 const TRAIL = 1.5; // s
 const TILES = 10; // tiles of the floor on each side
 const MOMENTS = 30, PATH_POINTS = 600; // samples of a replay that the first view contains, and points of its path
+const CORNER = 40, AXIS = 24, LETTER = 33; // pixels of the axes in the corner: their origin, length, and letters
+const LETTERS = [
+  [[[-3, -4], [3, 4]], [[-3, 4], [3, -4]]],
+  [[[-3, 4], [0, 0], [3, 4]], [[0, 0], [0, -4]]],
+  [[[-3, 4], [3, 4], [-3, -4], [3, -4]]],
+]; // strokes of x, y and z, pixels
 const SLOW = 0.04, SLOW_FRAMES = 10; // s: longer frames are slow; successive slow frames that end anti-aliasing
 
 export class Picture {
@@ -71,6 +77,7 @@ export class Picture {
       if (shadow && scene.fineness > 1) scene.addSolid(i + 1, multiply(shadow, model), [...fractions(styled("--shade")), 2]);
     });
     this.addTrail(scene, k, links);
+    this.addAxes(scene);
     scene.draw(camera, fractions(styled("--scene")), Number(styled("--bright")));
   }
 
@@ -89,6 +96,19 @@ export class Picture {
     const shadow = placed([0, 0, 0]);
     shadow[5 * normal] = 0;
     return shadow;
+  }
+
+  /** @type {(scene: Scene) => void} Draw the directions of the root's axes in the lower left corner. */
+  addAxes(scene) {
+    const { camera } = this, { clientWidth, clientHeight } = scene.canvas, { centre, back, right, up } = camera;
+    /** @type {(x: number, y: number) => number[]} The point some pixels to the right of the origin and above it. */
+    const at = (x, y) => camera.meet((CORNER + x) / clientWidth, 1 - (CORNER + y) / clientHeight, centre, back) ?? centre;
+    for (const axis of [0, 1, 2].sort((a, b) => back[a] - back[b])) { // the nearest last
+      const [x, y] = [right[axis], up[axis]], colour = [...AXIS_COLOURS[axis], 1];
+      if (Math.hypot(x, y) < 0.2) continue; // along the line of sight
+      scene.addLine([at(0, 0), at(AXIS * x, AXIS * y)], colour, 1.5);
+      for (const stroke of LETTERS[axis]) scene.addLine(stroke.map(([dx, dy]) => at(LETTER * x + dx, LETTER * y + dy)), colour, 1.2);
+    }
   }
 
   /** @type {(scene: Scene, k: number, links: Float64Array[]) => void} Everything drawn besides the robot. */
