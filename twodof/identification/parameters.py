@@ -322,7 +322,7 @@ class Parameters:
         """
         step, values, column, row = 1e-30, self.values(x.astype(complex)), 0, 0
         rates = Dynamics(*(np.zeros((*each.shape, len(x))) for each in self.dynamics(self.start)))
-        reported = np.zeros((len(self.names), len(x)))
+        reported = np.zeros((sum(len(free.names) for free in self.free), len(x)))
         for free in self.free:
             own, rows, columns = free.of(values), len(free.names), slice(column, column + free.size)
             before = own.copy()
