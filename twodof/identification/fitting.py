@@ -30,6 +30,8 @@ from .stretches import Array, Stretch, jumps, stretches
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+SURE, SEPARATE = 10.0, 1e-6
+"""Standard deviations above 0, and relative singular value, from which on data determine a load."""
 WRONG_UNITS = 300.0
 """Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
 WRONG_RANGE = 3.0
@@ -190,25 +192,45 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
     few = stretch.part(slice(None, None, max(1, len(stretch.t) // 200)))
     Y, G = regressors(robot, few, values, np.empty(0, np.int64))
     model = Y[:, :, 0] + np.einsum("g,kgi->ki", values.gravity, G[:, :, :, 0])
-    ours, theirs = np.sqrt(np.mean(model**2, axis=0)), np.sqrt(np.mean(few.tau**2, axis=0))
-    for joint, effort in zip(robot.joints, theirs):
-        if not effort:
+    for joint, effort in zip(robot.joints, few.tau.T):
+        if not effort.any():
             raise InputError(f"the effort of joint '{joint}' is 0 throughout: it was not recorded")
-    ratios = theirs / np.maximum(ours, 1e-12)
-    high = np.flatnonzero(ratios > WRONG_UNITS).tolist()
-    # friction of a joint with little load can have such a ratio, but is smaller than the largest load of the robot
-    if len(high) == 1 < len(ratios) and theirs[high[0]] == max(theirs.max(), ours.max()):
+    turning = ~np.array(robot.prismatic)
+    own = zip(few.tau.T, G[:, :, :, 0].transpose(2, 0, 1), Y[:, :, 0].T, few.v.T, few.a.T)
+    scales = np.array([_gravity_of(*each) for each in own])[turning] / max(np.linalg.norm(values.gravity), 1e-300)
+    theirs, ours = (np.sqrt(np.mean(each**2, axis=0))[turning] for each in (few.tau, model))
+    usual = np.exp(np.median(np.log(scales[known]))) if (known := np.isfinite(scales)).any() else 1.0
+    if not 1.0 / WRONG_UNITS < usual < WRONG_UNITS:
         raise InputError(
-            f"the recorded efforts of joint '{robot.joints[high[0]]}' are {ratios[high[0]]:.2g} times those of the"
-            " URDF's masses, unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them,"
-            " or correct the masses"
-        )
-    ratio = float(np.median(ratios))
-    if not 1.0 / WRONG_UNITS < ratio < WRONG_UNITS:
-        raise InputError(
-            f"the recorded efforts are {ratio:.2g} times those of the URDF's masses: they are probably not in N·m,"
+            f"the recorded efforts are {usual:.2g} times those of the URDF's masses: they are probably not in N·m,"
             " but for example in N·mm, a factor of 1000; convert them, or correct the masses"
         )
+    high = np.flatnonzero(scales > WRONG_UNITS).tolist()  # a payload can do so to a light wrist, but not to it alone
+    if len(high) == 1 and theirs[high[0]] == max(theirs.max(), ours.max()):
+        joint = np.array(robot.joints)[turning][high[0]]
+        raise InputError(
+            f"the recorded efforts of joint '{joint}' are {scales[high[0]]:.2g} times those of the URDF's masses,"
+            " unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them, or correct the"
+            " masses"
+        )
+
+
+def _gravity_of(tau: Array, loads: Array, inertia: Array, v: Array, a: Array) -> float:
+    """Return the gravity that explains a joint's efforts beside inertia, friction, damping and armature, m/s².
+
+    NaN if the data do not determine it, as for a joint without load. ``loads`` are efforts of gravity of 1 m/s² along
+    each axis, N × 3.
+    """
+    columns = np.column_stack([loads, inertia, np.sign(v), v, a])
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    U, strengths, directions = np.linalg.svd(columns / size, full_matrices=False)
+    inverse = directions.T / np.where(strengths > SEPARATE * strengths[0], strengths, np.inf)
+    noise = float(np.sum((tau - U @ (U.T @ tau)) ** 2)) / max(1, len(tau) - len(size))
+    found, deviation = (inverse @ U.T @ tau / size)[:3], np.sqrt(noise * np.sum(inverse**2, axis=1))[:3] / size[:3]
+    loaded = np.abs(loads).max() > SEPARATE * np.abs(tau).max()
+    sure = loaded and np.linalg.norm(found) > SURE * np.linalg.norm(deviation)
+    return float(np.linalg.norm(found)) if sure else np.nan
 
 
 def _result(
