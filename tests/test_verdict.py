@@ -367,7 +367,7 @@ def test_the_search_for_the_nearest_point_of_a_long_chain_has_a_bound() -> None:
     target, free, none = np.array([100.0, 3.0, 1.0]), np.full(moving, np.inf), np.empty(0)
     end = kinematics.end(f"l{moving + still}", np.zeros((1, moving))).translation[0]
     np.testing.assert_allclose(end, [0.1 * (moving + still), 0.0, 0.01 * (moving + still)])
-    search = {"axes": (0, 1, 2), "target": target, "quat": none, "low": -free, "high": free}
+    search: dict[str, Any] = {"axes": (0, 1, 2), "target": target, "quat": none, "low": -free, "high": free}
     found = nearest(kinematics, f"l{moving + still}", q=np.full(moving, 0.1), **search)
     assert found.distance < np.linalg.norm(target - end) + 1.0
     assert kinematics.count < still + 2 * reach.MOST_TURNS + 5 * moving
