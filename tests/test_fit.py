@@ -13,6 +13,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import pinocchio as pin
 import pytest
 from motions import assert_true, bag_of, move, mujoco_model, noisy
 
@@ -316,6 +317,18 @@ def test_a_bag_that_is_given_twice_is_refused(bag):
         twodof.fit(ARM, bag, FREE, gravity=(0.0, float("nan"), 0.0))
 
 
+@pytest.mark.parametrize(("gravity", "friction"), [((0.0, 0.0, -9.81), [4.0, 3.0]), (GRAVITY, [0.1, 30.0])])
+def test_efforts_of_friction_alone_are_not_taken_for_another_unit(gravity, friction, tmp_path):
+    """Joints about the vertical carry no load, and gears may have much more friction than their joint has load."""
+    model, t = pin.buildModelFromUrdf(str(ARM)), 0.01 * np.arange(3000)[:, None]
+    model.gravity.linear = np.array(gravity)
+    data, w = model.createData(), np.array([0.9, 1.3])
+    q, v, a = np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)
+    tau = np.array([pin.rnea(model, data, *each) for each in zip(q, v, a)]) + friction * np.sign(v)
+    found = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, tau), "friction[*]", gravity=gravity)
+    assert [each.after for each in found.parameters] == pytest.approx(friction, rel=0.01)
+
+
 def test_masses_near_zero_are_refused_in_a_line(bag, tmp_path):
     """In SciPy the prior of such masses is infinite."""
     light = tmp_path / "light.urdf"
@@ -353,6 +366,20 @@ def test_damping_of_a_robot_of_one_joint_is_found(tmp_path):
     assert np.ptp(np.diff(wrapped, axis=0)) > 6.0
     bag = bag_of(tmp_path / "wrapped", ["hub"], wrapped, 0.1 * a + 0.3 * v)
     assert twodof.fit(urdf, bag, "damping[*]").parameters[0].after == pytest.approx(0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize("encoder", ["one turn", "many turns"])
+@pytest.mark.parametrize(("jitter", "kept"), [(0.0, 1.0), (0.4, 1.0), (0.0, 0.9)], ids=["even", "uneven", "lost"])
+def test_positions_of_a_fast_joint_are_unwrapped_only_if_they_wrap(encoder, jitter, kept):
+    rng = np.random.default_rng(4)
+    t = 0.04 * (np.arange(500) + jitter * rng.uniform(-1.0, 1.0, 500))[rng.random(500) < kept]
+    robot: Any = SimpleNamespace(joints=("j",), prismatic=(False,), q_min=(-1.8e308,), q_max=(1.8e308,))
+    recording: Any = SimpleNamespace(t=t, path="bag")
+    speed = 25.0 if encoder == "one turn" else 165.0  # rad/s: up to a sixth, or a turn, between two samples
+    q = (speed / 1.3 * np.sin(1.3 * t) + 0.3)[:, None]
+    measured = (q + np.pi) % (2.0 * np.pi) - np.pi if encoder == "one turn" else q
+    found = stretches._unwrapped(recording, robot, measured)
+    np.testing.assert_allclose(np.diff(found, axis=0), np.diff(q, axis=0), atol=1e-9)
 
 
 def test_a_recording_of_a_very_high_rate_is_reduced_to_the_band():

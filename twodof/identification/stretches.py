@@ -136,16 +136,19 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
 def _unwrapped(recording: Recording, robot: Robot, q: Array) -> Array:
     """Return positions in which joints without limits have no jumps of a turn; some encoders wrap at ±π.
 
-    A step is a wrap if it is within a tenth of a turn of the step before it and one turn.
+    Such positions stay within a turn, and a step is a wrap if without a turn it is within a tenth of a turn of what the
+    speed of the step before it gives.
 
     Raises:
         InputError: a joint with limits jumps by a turn.
     """
     late = np.diff(recording.t)
     turn, steps = 2.0 * np.pi, np.diff(q, axis=0)
-    turns = np.where(np.array(robot.prismatic), 0.0, np.round(steps / turn))
-    before = np.vstack([steps[:1], steps[:-1]])
-    turns[np.abs(steps - turn * turns - np.where(np.abs(before) < turn / 2.0, before, 0.0)) > WRAP * turn] = 0.0
+    within = (np.ptp(q, axis=0) < (1.0 + WRAP) * turn) & ~np.array(robot.prismatic)
+    turns = np.where(within, np.round(steps / turn), 0.0)
+    speeds = (steps - turn * turns) / np.maximum(late, 1e-300)[:, None]
+    before = np.vstack([speeds[:1], speeds[:-1]]) * late[:, None]
+    turns[np.abs(steps - turn * turns - before) > WRAP * turn] = 0.0
     for i, joint in enumerate(robot.joints):
         jumps = np.flatnonzero(turns[:, i] * (late < GAP * np.median(late)))
         if robot.q_min[i] > -UNBOUNDED and len(jumps):
