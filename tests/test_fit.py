@@ -395,6 +395,16 @@ def test_a_recording_of_a_very_high_rate_is_reduced_to_the_band():
         np.testing.assert_allclose(each.tau[:, 0], np.cos(3.0 * each.t), atol=1e-6)
 
 
+def test_a_pause_that_a_slow_recording_has_between_all_samples_is_no_gap():
+    t = 1e-3 * np.arange(10_000)
+    t = t[np.arange(len(t)) % 1000 > 8]  # 9 ms are missing in each second
+    q, tau = np.sin(3.0 * t)[:, None], np.cos(3.0 * t)[:, None]
+    recording: Any = SimpleNamespace(t=t, q=q, tau=tau, joints=("j",), path="hurried")
+    robot: Any = SimpleNamespace(joints=("j",), prismatic=(True,), q_min=(-2.0,), q_max=(2.0,))
+    (fitted,), _ = stretches.stretches([recording], robot)
+    np.testing.assert_allclose(fitted.v[:, 0], 3.0 * np.cos(3.0 * fitted.t), atol=2e-3)
+
+
 def test_samples_near_rest_are_found_whatever_the_window() -> None:
     moving = np.random.default_rng(1).random((60, 2)) > 0.1
     for reach in (0, 1, 3, 100):

@@ -30,7 +30,8 @@ MOST_NOISE = 3e-4
 """Largest share of noise in the power of accelerations; noise in regressors makes inertias too small."""
 CUTOFF, ORDER = 2.5, 5
 """Cut-off of the filter of positions as a multiple of the band, and its order in one direction."""
-GAP = 3.5  # multiple of the usual time between samples that counts as a gap
+GAP, FINE = 3.5, 0.01
+"""Multiple of the usual time between samples that counts as a gap, and the least usual time that counts for it, s."""
 SHORTEST = 2.0  # s: shortest stretch between gaps
 EDGE = 0.15  # s at both ends of a stretch that are not used, because the filter has samples on one side only
 HELD_OUT = 0.2  # fraction of each recording, at its end
@@ -111,7 +112,7 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
         _check_spikes(recording, robot, q)
         if 1.0 / h < LEAST_RATE:
             raise InputError(f"'{name}' has {1.0 / h:.3g} joint states a second; a fit needs {LEAST_RATE:g}")
-        cuts = [0, *(np.flatnonzero(np.diff(t) > GAP * h) + 1), len(t)]
+        cuts = [0, *(np.flatnonzero(np.diff(t) > GAP * max(h, FINE)) + 1), len(t)]
         whole = [(a, b) for a, b in pairwise(cuts) if t[b - 1] - t[a] >= SHORTEST]
         if not whole:
             raise InputError(f"'{name}' is too short: a fit needs {SHORTEST:g} s without a gap")
