@@ -40,9 +40,9 @@ HIDDEN: dict[str, Any] = {
 }  # fmt: skip
 
 
-def arm_motion(**changed: Any) -> Any:
+def arm_motion(seed: int = 0, **changed: Any) -> Any:
     hidden = {"payload": 0.15, "end": "EndEffector", **HIDDEN, **changed}
-    return move(mujoco_model(ARM.read_text("utf-8"), **hidden), [-0.5, 0.6], 0.8, 30.0, fastest=2.0)
+    return move(mujoco_model(ARM.read_text("utf-8"), **hidden), [-0.5, 0.6], 0.8, 30.0, seed=seed, fastest=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +146,16 @@ def test_only_numbers_of_the_urdf_change(bag):
     added = re.sub(r"\n *<dynamics [^>]*/>", "", after)
     assert re.sub(number, "#", before) == re.sub(number, "#", added)
     assert after.count("<dynamics friction=") == 2
+
+
+def test_two_recordings_have_narrower_intervals_than_each(motion, bag, tmp_path):
+    q, effort = noisy(arm_motion(seed=1))
+    other = bag_of(tmp_path / "other", JOINTS, q, effort)
+    one, two, both = (twodof.fit(ARM, bags, FREE, gravity=GRAVITY) for bags in (bag, other, [bag, other]))
+    for first, second, joint in zip(one.parameters, two.parameters, both.parameters):
+        together = (first.deviation**-2 + second.deviation**-2) ** -0.5
+        assert joint.deviation == pytest.approx(together, rel=0.25), joint.name
+        assert abs(joint.after - TRUTH[joint.name]) < 3.0 * joint.deviation
 
 
 def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):

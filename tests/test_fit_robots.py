@@ -103,10 +103,24 @@ def test_all_masses_of_a_ur5_that_can_be_seen_are_found(tmp_path):
     assert far.max() <= 3.5
     assert np.sum(far_before > 3.5) >= 12  # the comparison is sharp: it refuses the URDF from before the fit
 
-    fitted = load_robot((tmp_path / "fitted" / "robot.urdf").read_text("utf-8"), "tool0", "xyz").model
+    urdf = tmp_path / "fitted" / "robot.urdf"
+    fmu = twodof.build_fmu(tmp_path / "fitted.fmu", twodof.FmuOptions(urdf, frame="tool0", meshes=False))
+    assert twodof.simulate(fmu, stop_time=0.1).last.q == pytest.approx([0.0] * 6, abs=1e-6)
+    fitted = load_robot(urdf.read_text("utf-8"), "tool0", "xyz").model
     for _ in range(200):
         M = pin.crba(fitted, fitted.createData(), rng.uniform(-3.0, 3.0, 6))
         assert np.linalg.eigvalsh(np.triu(M) + np.triu(M, 1).T)[0] > 0.0
+
+
+def test_a_hidden_spring_of_a_ur5_is_reported_with_its_joint(tmp_path):
+    """Its stiffness is 5 N·m/rad; the largest load of its joint is some 20 N·m."""
+    text = UR5.read_text("utf-8")
+    robot, friction = load_robot(text, "tool0", "xyz"), [6.0, 8.0, 4.0, 1.5, 1.0, 1.0]
+    model = mujoco_model(text, friction=friction, stiffness=[0.0, 0.0, 5.0, 0.0, 0.0, 0.0])
+    bag = bag_of(tmp_path / "bag", robot.joints, *noisy(move(model, [0, -1.2, 1.2, -0.5, 0.3, 0], 0.9, 20.0)))
+    result = twodof.fit(UR5, bag, ("friction[*]", "damping[*]", "payload"), frame="tool0")
+    assert not result.explains
+    assert any("does not explain" in line and "'elbow_joint'" in line for line in result.remarks)
 
 
 def efforts(robot: Any, names: list[str], values: np.ndarray, states: list[np.ndarray]) -> np.ndarray:
