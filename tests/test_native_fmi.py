@@ -311,7 +311,7 @@ def forged(arm, field, value):
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
     joints = len(arm.of.robot.joints)
-    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}d2i{3 * joints}d{3 * joints + 4}i6iQ")
+    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}d2i{3 * joints}d{3 * joints + 4}id6iQ")
     fields = list(layout.unpack(blob))
     names = ["time", "stop_time", "step_start"]
     names += [f"step_{kind}[{i + 1}]" for kind in ("q", "v", "a") for i in range(joints)]
@@ -321,7 +321,7 @@ def forged(arm, field, value):
     names += [f"pending{k}[{i + 1}]" for k in range(11) for i in range(joints)]
     names += ["waiting", "clock"] + [f"before_{kind}[{i + 1}]" for kind in ("tau", "q", "v") for i in range(joints)]
     names += [f"{what}[{i + 1}]" for what in ("held", "watched", "slip") for i in range(joints)]
-    names += ["any_held", "any_watched", "any_slip", "rank", "phase", "initialised"]
+    names += ["any_held", "any_watched", "any_slip", "rank", "acting", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
     place = n + 1 + names.index(field) if field in names else 1 + arm.of.index(field)
     fields[place] = value
@@ -342,6 +342,7 @@ FORGERIES = {
     "held[1]": ((4, -1), UNSOUND),
     "slip[1]": ((2, -2), UNSOUND),
     "watched[2]": ((1, 7), UNSOUND),  # of a joint that is not held
+    "acting": ((np.nan, np.inf, -1.0), UNSOUND),
     "phase": ((-1, 4, 5, 7, 77, 2**31 - 1, -(2**31)), UNSOUND),
     "time": ((np.nan, np.inf, -np.inf), UNSOUND),
     "stop_time": ((np.nan, -np.inf), UNSOUND),
