@@ -10,6 +10,7 @@ import base64
 import hashlib
 import html
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
@@ -33,6 +34,7 @@ from ..simulation.cause import KINDS
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 
+SCENE = logging.getLogger("twodof.ros.scene")
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables in a sample, in their order."""
 LIMITS = ("low", "high", "effort", "velocity")  # of a joint
@@ -125,14 +127,25 @@ def page_of(run: Experiment) -> bytes:
 
 
 def _topics(run: Experiment) -> dict[str, object]:
-    """Return topics and message definitions of a bag with the run's scene and efforts."""
-    messages = Messages(run, scene=True, effort=bool(run.fmu.vector("tau")))
+    """Return topics and message definitions of a bag with the run's scene and efforts.
+
+    The scene does not warn of meshes that cannot be read: the arm of the page has done so.
+    """
+    SCENE.addFilter(_reject)
+    try:
+        messages = Messages(run, scene=True, effort=bool(run.fmu.vector("tau")))
+    finally:
+        SCENE.removeFilter(_reject)
     topics = [
         {"name": name, "type": kind, "qos": profile(qos), **template}
         for name, template in messages.templates().items()
         for kind, qos in [messages.topics[name]]
     ]
     return {"topics": topics, "definitions": {kind: definition(kind) for kind, _ in messages.topics.values()}}
+
+
+def _reject(_: logging.LogRecord) -> bool:
+    return False
 
 
 def is_page(path: Path) -> bool:
