@@ -94,8 +94,10 @@ def alive(browser: Browser, arm: Path) -> Iterator[Page]:
 
 @pytest.fixture
 def page(alive: Page) -> Page:
-    """The default arm's page, at its start and paused."""
+    """The default arm's page, at its start and paused, with one slider for each gain."""
     alive.evaluate("() => { arm.play(false); arm.startAgain(true); arm.message = ''; }")
+    for button in alive.locator("#arm-controls button[aria-expanded=true]").all():
+        button.click()
     press(alive, "View")
     return alive
 
