@@ -15,11 +15,13 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.optimize
 from motions import assert_true, bag_of, move, mujoco_model, noisy
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
+from twodof.identification import estimate as estimation
 from twodof.identification import fitting, parameters, stretches
 from twodof.identification.estimate import Misfit, Suspect, estimate
 from twodof.identification.fitting import read_model
@@ -127,6 +129,25 @@ def test_a_derivative_recomputes_the_changed_link_alone(monkeypatch):
         np.testing.assert_allclose(reported[:, k], (own.reported(up) - own.reported(down)) / 2e-6, atol=1e-7)
         for rate, a, b in zip(rates, own.dynamics(up), own.dynamics(down)):
             np.testing.assert_allclose(rate[..., k], (a - b) / 2e-6, atol=1e-7)
+
+
+def test_a_fit_needs_a_tenth_of_the_dynamics_evaluations_of_finite_differences(bag, monkeypatch):
+    """An evaluation is one call of Pinocchio for one sample; with differences, each residual is an inverse dynamics."""
+    model, calls, residuals = read_model(ARM, FREE, gravity=GRAVITY), count(), count()
+    fitted, _ = stretches.stretches([twodof.read_bag(bag)], model.robot)
+    free = model.parameters(GRAVITY)
+    for name in ("computeJointTorqueRegressor", "computeRNEADerivatives"):
+        own = getattr(pin, name)
+        monkeypatch.setattr(pin, name, lambda *values, own=own: (next(calls), own(*values))[1])
+    exact, evaluations = estimate(free, fitted), next(calls)
+
+    def by_differences(errors: Any, inside: Any, rates: Any, **options: Any) -> Any:
+        return scipy.optimize.least_squares(lambda z: (next(residuals), errors(z))[1], inside, "2-point", **options)
+
+    monkeypatch.setattr(estimation, "least_squares", by_differences)
+    other = estimate(free, fitted)
+    assert np.all(np.abs(other.x - exact.x) <= 0.01 * np.sqrt(np.diag(exact.covariance)))
+    assert 10 * evaluations <= next(residuals) * sum(len(each.t) for each in fitted)
 
 
 def test_a_urdf_that_cannot_be_written_is_refused_before_the_fit(bag, monkeypatch, tmp_path):
