@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from twodof.files import temporary_folder
+
 
 def run_folder() -> Path:
     """The folder of this run; the last hook below removes it."""
@@ -33,6 +35,8 @@ class Scratch:
     def pytest_sessionfinish(self, session: pytest.Session) -> Iterator[None]:
         """Check the folder after all workers have ended, before the summary."""
         yield
+        with temporary_folder():  # removes those of processes that tests have killed, as the next process does
+            pass
         own = Path(get_temp_dir()).name  # multiprocessing removes it when this process ends
         self.left = sorted({path.name for path in (self.folder / "tmp").iterdir()} - {own})
         if self.left and session.exitstatus == pytest.ExitCode.OK:

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
 from harness import python
 
 HERE = Path(__file__).parent
@@ -24,6 +25,13 @@ def test_it(i):
     tools.needs("nowhere")
 """
 KEPT = "import tempfile\ndef test_it(tmp_path):\n    tempfile.mkdtemp(prefix='kept-')\n"
+KILLED = """
+import os, subprocess, sys
+TEXT = "import os, twodof.files as f\\nwith f.temporary_folder(): os.kill(os.getpid(), 9)"
+def test_it(tmp_path):
+    assert subprocess.call([sys.executable, "-c", TEXT]) == -9
+    assert any(name.startswith(".twodof.tmp") for name in os.listdir(os.environ["TMPDIR"]))
+"""
 CLEAN = "import tempfile\ndef test_it(tmp_path):\n    tempfile.TemporaryDirectory().cleanup()\n"
 
 
@@ -53,9 +61,11 @@ def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path):
         shutil.rmtree(folder)
 
 
-def test_a_run_that_leaves_nothing_removes_its_folder(tmp_path):
+@pytest.mark.parametrize("text", [CLEAN, KILLED], ids=["clean", "killed"])
+def test_a_run_that_leaves_nothing_removes_its_folder(text, tmp_path):
+    """The next process removes what a killed one leaves."""
     for options in (["-n", "0"], ["-n", "2"]):
-        done = ran(tmp_path, CLEAN, *options)
+        done = ran(tmp_path, text, *options)
         assert (done.returncode, done.stderr) == (0, "") and "1 passed" in done.stdout
         assert list((tmp_path / "tmp").iterdir()) == []
 
