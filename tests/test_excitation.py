@@ -125,7 +125,7 @@ def test_a_joint_whose_range_is_0_is_named(tmp_path):
     """Many URDFs have limits of 0 as placeholders."""
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(re.sub('lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"', ARM.read_text("utf-8"), count=1))
-    with pytest.raises(InputError, match="joint 'joint1' has a range of 0 in the URDF: correct its limits, or `lock`"):
+    with pytest.raises(InputError, match="joint 'joint1', with the joints that mimic it, has a range of 0"):
         twodof.excite(urdf, 5.0, "payload")
 
 

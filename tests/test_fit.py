@@ -263,6 +263,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         q[:, 1] = 0.3 + 1e-4 * np.random.default_rng(0).normal(size=len(q))
     elif change == "spikes":
         q[np.random.default_rng(0).choice(len(q), 6), 1] += 0.3
+    elif change == "anew":
+        q[1200:, 1] += 0.5 * np.pi
     elif change == "wrapped":
         q[:, 1] = (q[:, 1] - 0.6) % (2.0 * np.pi)
     elif change == "degrees":
@@ -293,6 +295,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("short", "is too short"),
         ("still", "joint 'joint2' never moves"),
         ("spikes", "the position of joint 'joint2' in"),
+        ("anew", "the position of joint 'joint2' in"),
         ("wrapped", "jumps by a turn at"),
         ("degrees", "rad: they are probably in degrees"),
         ("nan", "the position of joint 'joint2' at 7 s is not a number"),

@@ -106,7 +106,10 @@ class _Design:
         self._effort = MARGIN * np.array(robot.effort)
         for joint, reach in zip(robot.joints, self._reach):
             if not reach > 0.0:
-                raise InputError(f"joint '{joint}' has a range of 0 in the URDF: correct its limits, or `lock` it")
+                raise InputError(
+                    f"joint '{joint}', with the joints that mimic it, has a range of 0 in the URDF: correct the limits,"
+                    " or `lock` it"
+                )
         still = self._sampled(np.zeros(self.shape), COARSE)
         for joint, effort, most in zip(robot.joints, np.abs(still.tau[0]), self._effort):
             if effort >= most:

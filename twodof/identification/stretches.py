@@ -37,6 +37,8 @@ EDGE = 0.15  # s at both ends of a stretch that are not used, because the filter
 HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
 SPIKES = 0.01  # largest fraction of samples that are spikes
+LONE, LEAST_JUMP = 10.0, 0.05
+"""Ratio of a jump of the position to the steps before and after it, and the smallest jump, rad or m."""
 LEAST_SPEED = 0.03  # fraction of the highest speed, below which the filter's ripple may hide that a joint rests
 LEAST_RATE = 20.0  # Hz
 MOST_RATE = 100.0 * MOST_BAND  # Hz: means of as many samples as keep this rate replace those of a far higher one
@@ -162,16 +164,21 @@ def _unwrapped(recording: Recording, robot: Robot, q: Array) -> Array:
 
 
 def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
-    """Refuse positions of which a few samples are far from the samples before and after them.
+    """Refuse positions of which a few samples are far from the samples before and after them, or that jump once.
 
     Raises:
-        InputError: the message has the joint, the largest spike and the number of spikes.
+        InputError: the message has the joint, the largest spike or jump, and the number of spikes.
     """
     low, high = np.percentile(q, (1.0, 99.0), axis=0)
     steps = np.diff(q, axis=0)
     usual = np.percentile(np.abs(steps), 100.0 * (1.0 - 2.0 * SPIKES), axis=0)
     there_and_back = np.where(steps[1:] * steps[:-1] < 0.0, np.minimum(np.abs(steps[1:]), np.abs(steps[:-1])), 0.0)
-    spikes = there_and_back > np.maximum(MIXED * (high - low), 3.0 * usual)
+    least = np.maximum(MIXED * (high - low), 3.0 * usual)
+    spikes = there_and_back > least
+    # a step that is not a gap, much larger than those before and after it, between which speeds would jump
+    near = np.pad(np.abs(steps), ((1, 1), (0, 0)))
+    alone = np.abs(steps) > np.maximum(np.maximum(least, LEAST_JUMP), LONE * np.maximum(near[2:], near[:-2]))
+    alone &= (np.diff(recording.t) < GAP * np.median(np.diff(recording.t)))[:, None]
     for i, joint in enumerate(robot.joints):
         count = int(spikes[:, i].sum())
         if high[i] > low[i] and 0 < count <= SPIKES * len(q):
@@ -180,6 +187,12 @@ def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
                 f"the position of joint '{joint}' in '{recording.path}' jumps by {there_and_back[k, i]:.3g} and back"
                 f" with the next sample, most at {recording.t[k + 1]:.4g} s, in {count} of {len(q)} samples: leave"
                 " these samples out"
+            )
+        if alone[:, i].any():
+            k = int(np.argmax(alone[:, i] * np.abs(steps[:, i])))
+            raise InputError(
+                f"the position of joint '{joint}' in '{recording.path}' jumps by {steps[k, i]:.3g} at"
+                f" {recording.t[k + 1]:.4g} s: was its encoder set anew, or are there two recordings?"
             )
 
 
