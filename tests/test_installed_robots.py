@@ -15,7 +15,7 @@ from twodof.export.stock_robots import stock_robots
 
 @pytest.mark.parametrize(
     ("name", "srdf", "pose", "frame"),
-    [("panda", "panda", "default", "panda_hand_tcp"), ("z1", "z1", "home", ""), ("ur5_robot", "", "", "tool0")],
+    [("panda", "panda", "default", "panda_hand_tcp"), ("z1", "z1", "home", ""), ("quadruped", "", "", "")],
 )
 def test_a_robot_has_its_home_pose_as_pinocchio_reads_it(name, srdf, pose, frame, tmp_path):
     path = stock_robots()[name]
@@ -29,6 +29,36 @@ def test_a_robot_has_its_home_pose_as_pinocchio_reads_it(name, srdf, pose, frame
     starts = [fmu.start_values[name] for name in fmu.vector("q_start")]
     for joint, start in zip(fmu.joints, starts):
         assert start == pytest.approx(q[model.joints[model.getJointId(joint)].idx_q], abs=1e-12), joint
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"),
+    [
+        ("tiago_no_hand", "wrist_ft_tool_link"),
+        ("tiago", "hand_tool_link"),
+        ("anymal-kinova", "j2s6s200_end_effector"),
+        ("b1-z1", "gripperMover"),
+        ("so101", "gripper_frame_link"),
+        ("ur10_robot", "tool0"),
+        ("human", "left_hand"),
+    ],
+)
+def test_the_end_effector_is_neither_a_wheel_nor_a_foot_of_a_robot_with_an_arm(name, frame):
+    assert twodof.stock_robot(name).frame == frame
+
+
+@pytest.mark.parametrize("name", ["ur3_robot", "ur5_joint_limited_robot", "ur10_robot"])
+def test_an_arm_of_universal_robots_does_not_start_in_a_singular_pose(name):
+    options = twodof.stock_robot(name)
+    model = pin.buildModelFromUrdf(str(options.urdf))
+    assert isinstance(options.q_start, dict) and options.frame
+    ratios = []
+    for home in ({}, options.q_start):
+        q = np.array([home.get(joint, 0.0) for joint in model.names[1:]])
+        frame = model.getFrameId(options.frame)
+        sigma = np.linalg.svd(pin.computeFrameJacobian(model, model.createData(), q, frame), compute_uv=False)
+        ratios.append(sigma[-1] / sigma[0])
+    assert ratios[0] < 1e-3 and ratios[1] > 0.03, ratios
 
 
 def test_a_panda_by_name_has_its_meshes(tmp_path, monkeypatch):

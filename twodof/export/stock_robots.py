@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from math import tau
 from pathlib import Path
 
@@ -24,7 +25,10 @@ CACHE = "ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"
 """Environment variable of robot_descriptions, and its default."""
 HOMES = ("home", "default", "standing", "half_sitting", "neutral")
 """Names of home poses in SRDF files, in the order of preference."""
-ENDS = ("tool0", "ee_link", "end_effector", "link_tcp")
+ELBOW_UP = {"shoulder_lift_joint": -1, "elbow_joint": 1, "wrist_1_joint": -1, "wrist_2_joint": -1}
+"""Home pose of Universal Robots' arms, whose SRDFs have none, in quarter turns; their zero pose is singular."""
+ENDS = ("tool", "tcp", "ee_link", "end_effector", "gripper_frame")
+"""Parts of names of end effectors, in the order of preference."""
 
 
 def stock_robots() -> dict[str, Path]:
@@ -43,7 +47,8 @@ def stock_robots() -> dict[str, Path]:
 def stock_robot(name: str, lock: Mapping[str, float] | None = None) -> FmuOptions:
     """Return the options with which a robot of an installed package is built.
 
-    The controlled link and the home pose come from the package's SRDF file, if it has one.
+    The home pose and the possible controlled links come from the package's SRDF file, if it has them. Among several
+    links, one with the name of a tool is controlled, or else the one that the most joints move.
 
     Args:
         name: a name of ``stock_robots``, e.g. "panda".
@@ -63,14 +68,18 @@ def stock_robot(name: str, lock: Mapping[str, float] | None = None) -> FmuOption
     except RobotError as error:
         raise BuildError(f"{path.name}: {error}") from error
     semantics = _semantics(path)
-    ends = [str(end.get("parent_link")) for end in semantics.iterfind("end_effector")]
-    leaves = last_links(urdf)
-    frames = [link for link in (*ends, *ENDS, *leaves) if link in leaves or (link in ends and link in urdf.links)]
+    ends = [end for e in semantics.iterfind("end_effector") if (end := str(e.get("parent_link"))) in urdf.links]
     folder = next((parent.parent for parent in path.parents if parent.name == PACKAGE), None)
     fixed = {joint for pattern in lock or {} for joint in fnmatch.filter(urdf.joints, pattern)}
     home = {joint: value for joint, value in _home(semantics, urdf).items() if joint not in fixed}
-    frame = frames[0] if frames else None
+    frame = min(ends or last_links(urdf), key=partial(_preference, urdf), default=None)
     return FmuOptions(urdf=path, mesh_dir=folder, frame=frame, q_start=home or None, lock=lock or {})
+
+
+def _preference(urdf: Urdf, link: str) -> tuple[int, int]:
+    """Return the sort key of a possible end effector: by its name, then by the number of joints that move it."""
+    named = next((k for k, end in enumerate(ENDS) if end in link), len(ENDS))
+    return named, -sum(joint.moves for joint in urdf.chain(link))
 
 
 def _package(path: Path) -> Path:
@@ -95,6 +104,8 @@ def _home(semantics: ET.Element, urdf: Urdf) -> dict[str, float]:
     """Return the positions of the independent joints in the home pose, rad or m."""
     states = {str(state.get("name")): state for state in reversed(semantics.findall("group_state"))}
     state = next((states[name] for name in (*HOMES, *reversed(states)) if name in states), None)
+    if state is None and ELBOW_UP.keys() <= urdf.joints.keys():
+        return {joint: 0.25 * tau * turns for joint, turns in ELBOW_UP.items()}
     home = {}
     for element in [] if state is None else state.iterfind("joint"):
         joint = urdf.joints.get(str(element.get("name")))
