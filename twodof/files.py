@@ -214,9 +214,6 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Make a folder that is removed at the end, or by the next process if this one is killed.
 
     Without a parent folder it is in the system's folder for temporary files.
-
-    Raises:
-        OSError: it cannot be made.
     """
     try:
         parent = Path(tempfile.gettempdir() if parent is None else parent)

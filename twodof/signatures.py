@@ -48,11 +48,7 @@ def with_keywords_of(*delegates: Callable[..., object], name: str = "") -> Calla
 
 
 def _check_keywords(given: Iterable[str], called: Callable[..., object]) -> None:
-    """Refuse keywords that a function with ``**options`` does not accept.
-
-    Raises:
-        TypeError: a keyword is unknown; the message names the function and its nearest keyword.
-    """
+    """Refuse keywords that a function with ``**options`` does not accept."""
     import difflib
 
     parameters = signature(called).parameters.values()

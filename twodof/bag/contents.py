@@ -44,11 +44,7 @@ def _check_content(path: Path) -> None:
 
 
 def stated_count(folder: Path) -> int | None:
-    """Return the number of messages that metadata.yaml states; None if it states none.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return the number of messages that metadata.yaml states; None if it states none."""
     text = read_file(folder / "metadata.yaml", MAX_METADATA, follow=False).decode("utf-8", "replace")
     stated = re.search(r"^  message_count: (\d{1,18})$", text, re.MULTILINE)
     return int(stated[1]) if stated else None

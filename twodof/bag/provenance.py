@@ -213,11 +213,7 @@ def robot_in(path: Path) -> tuple[Path, str]:
 
 
 def each_robot(path: Path) -> list[Path]:
-    """Return the addresses of a bag's robots, as ``robot_in`` accepts them.
-
-    Raises:
-        BagError: the bag has more than MAX_ROBOTS robots.
-    """
+    """Return the addresses of a bag's robots, as ``robot_in`` accepts them."""
     robots = robots_of(path) if path.is_dir() else [""]
     if len(robots) > MAX_ROBOTS:
         one = f"give one, such as '{path}:{robots[0]}'"
@@ -234,9 +230,6 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
     """Return the provenance of a bag's robot; {} for a third-party bag.
 
     It is in the bag's folder, or in the metadata of a bag that is a single file.
-
-    Raises:
-        BagError: the provenance cannot be read, or is invalid.
     """
     single = path.suffix == ".mcap" and path.is_file()
     file = path if single else path / file_of(namespace)

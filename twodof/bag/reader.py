@@ -60,9 +60,6 @@ def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
     """Return the first and the last joint state of robots of one bag.
 
     Use the summaries of the files if all have a valid one; otherwise read the whole bag once.
-
-    Raises:
-        BagError: as ``read_bag``.
     """
     folder, _ = robot_in(paths[0])
     with _refusing(folder):

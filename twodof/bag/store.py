@@ -72,11 +72,7 @@ class Store:
         check_free(path, overwrite=overwrite)
 
     def enter(self, part: Part) -> None:
-        """Add one robot's part; the first one creates the folder.
-
-        Raises:
-            BagError: the bag cannot be written, or has samples already.
-        """
+        """Add one robot's part; the first one creates the folder."""
         with self._turn:
             if self._begun if self._entered else self._names and part.namespace not in self._names:
                 raise BagError(f"the bag '{self.path}' is being written and accepts no further robot")

@@ -80,11 +80,7 @@ class McapSummary:
 
 
 def read_summary(path: Path) -> McapSummary | None:
-    """Return the summary of an MCAP file; None without a valid one.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return the summary of an MCAP file; None without a valid one."""
     size = path.stat().st_size
     if path.suffix != ".mcap" or size < END + len(MAGIC):
         return None

@@ -42,11 +42,7 @@ ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
 
 
 def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
-    """Return the flavour, the files that the GUID covers, and a function that compiles the others.
-
-    Raises:
-        BuildError, RobotError: the message names the culprit; the compiling function raises them too.
-    """
+    """Return the flavour, the files that the GUID covers, and a function that compiles the others."""
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
     path = data_file("urdf", "2dof.urdf") if options.urdf is None else Path(options.urdf)

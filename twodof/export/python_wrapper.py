@@ -46,12 +46,6 @@ def check_python_wrapper(fmu: Path, library: Path, folder: Path, members: Mappin
     """Refuse an unzipped FMU whose wrapper would crash; repair the wrapper of an FMU that pythonfmu built.
 
     The wrapper decodes only the escape %20 in its path, and needs the module of the slave, which it imports by name.
-
-    Args:
-        fmu: the file, for errors.
-        library: the wrapper.
-        folder: the FMU's files.
-        members: checksums of the FMU's files, by name.
     """
     with library.open("rb") as file:
         content = file.read(MAX_WRAPPER)

@@ -29,16 +29,13 @@ def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]
 
 
 def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-    """Return position, rotation, Jacobian and drift of the task frame in the root's axes.
+    """Return x (3), R (3 × 3), J (6 × n: linear, angular) and J̇ v (6) of the task frame in the root's axes.
 
         J_i = z_i × (x − o_i), or z_i for a prismatic joint;   ω_i = ω_p + z_i v_i for a revolute joint
         J̇ v = Σ (ω_p + ω_i) × J_i v_i,   and of the angular rows Σ ω_p × z_i v_i
 
     Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 3.1 and 7.3; the
     sum over the joints is the acceleration there for q̈ = 0.
-
-    Returns:
-        x (3), R (3 × 3), J (6 × n: linear, angular), J̇ v (6).
     """
     rotations, origins = placements(robot, joint)
     rates = robot.G.dot(v)

@@ -194,11 +194,7 @@ def _solve(
 
 
 def _tolerance(plant: Plant, stimuli: Columns, found: Sequence[Columns]) -> tuple[float, list[str]]:
-    """Put the closed form into the references; return the tolerance, and the names with a closed form.
-
-    Raises:
-        BuildError: the solvers disagree, or disagree with the closed form.
-    """
+    """Put the closed form into the references; return the tolerance, and the names with a closed form."""
     first, second = found
     exact = _closed_form(plant, stimuli, first)
     first |= exact

@@ -52,9 +52,6 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
 
     The plant has the start values of the robot. The controller has those of the control law, its sampling and sensors.
     Common start values are set in both. Vectors of FMI 3.0 are scalars, because SSP 1.0 has no arrays.
-
-    Raises:
-        BuildError, RobotError: the message names the culprit.
     """
     law = CONTROLS[options.control]
     of_law = {*law.inputs, *law.parameters, *SENSORS, "control_period", "control_delay"}

@@ -32,11 +32,7 @@ class Type(NamedTuple):
     items: Mapping[str, int] = {}
 
     def value(self, given: object, name: str) -> Value | str:
-        """Return a value of this type for the variable ``name``; an item of an enumeration may be given by its name.
-
-        Raises:
-            InputError: the variable cannot have the value.
-        """
+        """Return a value of this type for the variable ``name``; an item of an enumeration may be given by its name."""
         if self.name == "Boolean":
             if not isinstance(given, bool):
                 raise InputError(f"{name} = {given!r:.50}: expected true or false")

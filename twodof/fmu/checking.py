@@ -32,7 +32,6 @@ class Row(NamedTuple):
     """The result of one trial.
 
     Attributes:
-        name: name of the trial.
         outcome: "passed"; "failed" (the standard forbids it); "remark" (the standard allows it, but a user would not
             expect it); or "does not apply".
         text: one line with the result, or with the reason.

@@ -53,7 +53,6 @@ class Point:
 
     Attributes:
         values: the point, by the names of the knowns.
-        unknowns: names of outputs and derivatives.
     """
 
     def __init__(self, trial: Trial) -> None:

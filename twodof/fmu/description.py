@@ -153,10 +153,6 @@ def _pose(fmu: Fmu) -> str:
 def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     """Read the description of any co-simulation FMU, of a robot or not; ``joints`` may be empty.
 
-    Args:
-        path: the FMU, or a system.
-        inside: member of the system that is the FMU.
-
     Raises:
         FmuError: the file is missing, is not a zip archive, is unsafe to unzip, or is not a co-simulation FMU of FMI
             2.0 or 3.0.
@@ -195,11 +191,7 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
 
 
 def problems_of(path: Path, inside: str = "") -> list[str]:
-    """Return the faults of an FMU's description in schema, variables, units and model structure.
-
-    Raises:
-        FmuError: there is no description to read.
-    """
+    """Return the faults of an FMU's description in schema, variables, units and model structure."""
     xml, _ = read_archive(path, inside)
     found: list[str] = []
     try:
@@ -271,11 +263,7 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
 
 
 def resource_reader(fmu: Fmu) -> Callable[[str], bytes | None]:
-    """Return a function that returns files of the FMU's resources/ folder, None without one; it keeps the FMU open.
-
-    Raises:
-        FmuError: as ``opened``, at the first file.
-    """
+    """Return a function that returns files of the FMU's resources/ folder, None without one; it keeps the FMU open."""
     archives, kept = list[zipfile.ZipFile](), ExitStack()
 
     def read(name: str) -> bytes | None:

@@ -152,11 +152,7 @@ TOOLS: dict[str, tuple[str, Run, str]] = {
 
 
 def require(tools: Sequence[str]) -> None:
-    """Refuse a tool that is unknown or not installed.
-
-    Raises:
-        InputError: the message names the tool and the remedy.
-    """
+    """Refuse a tool that is unknown or not installed."""
     for tool in tools:
         if tool not in TOOLS:
             raise InputError(f"`tools`: '{tool}' is unknown{choice(tool, TOOLS)}")

@@ -44,12 +44,10 @@ class Reference(NamedTuple):
     """An experiment with its reference results.
 
     Attributes:
-        name: name of the experiment.
         start, stop, step: times, s.
         tolerance: tolerance of the results; NaN if it states none.
         parameters: start values by name.
         stimuli, results: names of the columns without the time, and the numbers, with the time in the first column.
-        variables: the FMU's variables by name.
     """
 
     name: str
@@ -154,11 +152,7 @@ def _has_digest(related: ET.Element) -> bool:
 
 
 class _Files:
-    """Files in the folder of FMI-LS-REF.
-
-    Attributes:
-        digests: SHA3-256 of files by their URIs, as the manifest states them.
-    """
+    """Files in the folder of FMI-LS-REF, with SHA3-256 digests by URI as the manifest states them."""
 
     def __init__(self, fmu: Fmu, archive: zipfile.ZipFile) -> None:
         self._fmu, self._archive, self._folder = fmu, archive, posixpath.dirname(MANIFEST)

@@ -21,12 +21,10 @@ class Scalar:
 
     Attributes:
         name: name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])".
-        causality, unit: as in the description.
         type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description, with
             brackets for an array of Strings.
         start: text of the start value; None without one.
         description: description of the scalar, or of the whole array.
-        reference: value reference.
         variability: as in the description, or its default there.
         relative: whether it is a difference of values, to which the offset of a unit does not apply.
         element: 0-based index in the array, row by row.

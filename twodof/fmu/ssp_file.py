@@ -125,11 +125,7 @@ class Element:
 
 
 def read_ssp(path: Path) -> tuple[str, Element, DefaultExperiment, bytes]:
-    """Return name, top system, default experiment and the SHA-256 of structure and parameter sets of an SSP file.
-
-    Raises:
-        FmuError: the file is damaged, unsafe or invalid, or has an unsupported feature, which the message names.
-    """
+    """Return name, top system, default experiment and the SHA-256 of structure and parameter sets of an SSP file."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -284,11 +280,7 @@ def units_in(xml: ET.Element | None) -> dict[str, Unit]:
 
 
 def transformation(xml: ET.Element, what: str) -> Affine:
-    """Return the linear transformation of a connection or mapping entry.
-
-    Raises:
-        FmuError: the transformation has another kind, or is not finite.
-    """
+    """Return the linear transformation of a connection or mapping entry."""
     for child in xml:
         if child.tag.startswith(SSC) and child.tag.endswith("Transformation"):
             if child.tag != f"{SSC}LinearTransformation":

@@ -196,9 +196,6 @@ def instantiate_fmu(fmu: Fmu, name: str = "") -> Iterator[Instance]:
     """Instantiate an FMU from a temporary folder, and free the instance at the end.
 
     Its documentation is not unzipped. The name of the instance is that of its model by default.
-
-    Raises:
-        FmuError: it has no binary for this platform, or cannot be unzipped or loaded.
     """
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"

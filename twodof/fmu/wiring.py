@@ -58,11 +58,7 @@ class Wiring:
                 self._connect(element, connection)
 
     def scalar(self, node: Node) -> Scalar | None:
-        """Return a component's variable; None for a connector of a system.
-
-        Raises:
-            FmuError: the component has no such variable.
-        """
+        """Return a component's variable; None for a connector of a system."""
         if (fmu := self._fmus.get(node.element)) is None:
             return None
         if node.connector not in fmu.variables:
@@ -199,11 +195,7 @@ class Wiring:
 
 
 def conversion(path: object, source: Unit, target: Unit, what: str) -> Affine:
-    """Return the conversion between units; the identity if one of them is not stated.
-
-    Raises:
-        FmuError: the units differ in dimension, or are not defined.
-    """
+    """Return the conversion between units; the identity if one of them is not stated."""
     if not source.name or not target.name or source == target:
         return IDENTITY
     if source.exponents is None or target.exponents is None:
@@ -246,9 +238,6 @@ def order(path: object, fmus: Mapping[str, Fmu], links: Iterable[Link], initial:
     dependencies, it follows all of them.
 
     Args:
-        path: the system's file, for errors.
-        fmus: components by full name.
-        links: connections.
         initial: whether the instant is in initialisation mode, in which InitialUnknowns take precedence.
 
     Raises:

@@ -62,7 +62,6 @@ class Kinematics:
     """Forward kinematics of a robot.
 
     Args:
-        urdf: the robot.
         joints: names of the joints whose positions are the columns of q. Joints without a column follow the joint
             that they mimic, or rest at 0.
 

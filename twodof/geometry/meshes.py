@@ -55,9 +55,6 @@ class Meshes:
 
     Use it as a context manager. The meshes share a process; as they belong to one robot, a mesh that corrupts the
     memory of its reader can only spoil the picture of this robot.
-
-    Args:
-        read: returns the content of a mesh file.
     """
 
     def __init__(self, read: ReadMesh) -> None:

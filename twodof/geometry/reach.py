@@ -49,7 +49,6 @@ def nearest(
     """Return the reachable pose of a link that is nearest to a target.
 
     Args:
-        kinematics: kinematics of the robot.
         link: the link whose origin is compared.
         axes: root axes, 0 to 2, along which the target is given.
         target: position along the axes, m.

@@ -39,7 +39,6 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
 
     Args:
         robot: the robot, whose meshes have names ``package://meshes/…``.
-        read: function that returns the content of a mesh.
 
     Raises:
         RobotError: an attribute of a shape is not a number.

@@ -154,11 +154,7 @@ def is_page(path: Path) -> bool:
 
 
 def arm_of(run: Experiment) -> Arm:
-    """Return the page contents of a run's FMU.
-
-    Raises:
-        PageError: the robot cannot be shown.
-    """
+    """Return the page contents of a run's FMU."""
     fmu = run.fmu
     urdf = fmu.urdf or ""
     try:
@@ -200,8 +196,6 @@ def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "",
     """Return the HTML of an arm.
 
     Args:
-        title: title of the page.
-        arm: the robot.
         source: packed source of motion: "engine", or "samples", N × (time in s, groups in ``RECORDED``); empty: the
             server of the page, at /socket.
         allowed: further permissions of the page, in the syntax of a Content-Security-Policy.

@@ -67,8 +67,6 @@ class Loop:
 
     Attributes:
         recorded: the written bags.
-        pace: pace of the run.
-        steps: number of steps in real time.
         viewers: number of open pages; without one, the FMU is not stepped.
 
     Raises:

@@ -55,7 +55,6 @@ def replay(
     """Return the HTML of a bag's replay, and its remarks, one line each.
 
     Args:
-        bag: the bag, or its folder.
         urdf: the robot; None: the robot in the bag, if any.
         mesh_dir: folder of that URDF's packages or meshes.
         frame: the end effector's link; None: as in the run.

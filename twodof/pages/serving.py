@@ -233,9 +233,7 @@ async def relay(address: tuple[str, int], key: bytes, connection: Connection) ->
     """Pass messages between a websocket and a server of this process, until one of them closes.
 
     Args:
-        address: address of the server.
         key: key with which ``lock_port`` has locked it; b"": not locked.
-        connection: the websocket.
     """
     protocols = [connection.subprotocol] if connection.subprotocol else None
     inner = socket.socket()
@@ -267,7 +265,6 @@ def _is_own(request: Request, host: str, address: str, others: Collection[str] =
     only known names are accepted. A numeric address is not resolved, so a server on all addresses accepts any address.
 
     Args:
-        request: the request.
         host, address: the given host to listen on, and its resolved address.
         others: other permitted origins.
     """

@@ -64,7 +64,6 @@ class Slide(Hold):
         """Start a hold if a drop of the rank at t is chatter; return whether it is.
 
         Args:
-            t: time, s.
             y, rates: the state (q, v) and its derivative under the lower rank.
             tolerance: tolerance of the error test on a position.
             longest: upper bound of the hold, s.

@@ -50,12 +50,7 @@ def _weights(step: float) -> list[list[float]]:
 
 
 def dormand_prince(rates: Callable[[State], State], y: State, step: float, k1: State) -> tuple[State, list[State]]:
-    """Take one step from y with the derivative k1; return y_new and the derivatives at the stages.
-
-    Args:
-        rates: ẏ at a state.
-        step: s.
-    """
+    """Take one step from y with the derivative k1; return y_new and the derivatives at the stages."""
     s2, s3, s4, s5, s6, s7, _ = _weights(step)
     (a,) = s2
     k2 = rates([u + a * p for u, p in zip(y, k1)])

@@ -89,7 +89,6 @@ def search(
     """Return the first time in (a, b] at which a margin is negative, or infinity.
 
     Args:
-        margin: the margin.
         rate: its largest rate of change, which excludes intervals in which the margin cannot be negative.
         a, b: times within the step, s.
         at_a, at_b: the margin there.
@@ -113,12 +112,6 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, resolut
 
     The interpolation stays near the middle, so that it never needs many more evaluations than bisection. Source:
     Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020.
-
-    Args:
-        margin: the margin.
-        a, b: times within the step, s.
-        at_a, at_b: the margin there.
-        resolution: of the time, s.
     """
     k = 0.2 / (b - a)
     slack = b - a  # how much longer the interval may be than after bisection
@@ -145,10 +138,7 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, resolut
 def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float:
     """Return the first time at which a position is past a limit or a velocity past 0, or infinity.
 
-    Args:
-        margin: the distance to the limit or to 0.
-        slope: coefficients of its rate as a polynomial of time over the step, ascending.
-        step: size of the step, s.
+    ``slope`` has the coefficients of the margin's rate as a polynomial of time over the step, ascending.
     """
     before, at_before = 0.0, margin(0.0)
     for turn in (*sign_changes(slope), 1.0):
@@ -161,12 +151,9 @@ def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float
 
 
 def sign_changes(coefficients: Sequence[float]) -> list[float]:
-    """Return the points in (0, 1) at which a polynomial changes sign, in ascending order.
+    """Return the points in (0, 1) at which a polynomial with ascending coefficients changes sign, in ascending order.
 
     The polynomial is monotonic between the sign changes of its derivative.
-
-    Args:
-        coefficients: in ascending order.
     """
     if len(coefficients) == 1:
         return []

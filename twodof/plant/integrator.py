@@ -40,7 +40,6 @@ def advance(
         equations: the equations of motion, autonomous because inputs are held over the step.
         q, v: state at the beginning, n each; q within the limits.
         h: communication step, s, > 0.
-        stops: stops at the joints' limits, and joint friction.
         rtol, atol: tolerances of the error test on the state (q, v).
         max_step: largest integration step, s.
         integrator: DORMAND_PRINCE, STIFF, or AUTOMATIC, which changes to STIFF if a step fails because of stiff

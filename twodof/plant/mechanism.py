@@ -27,7 +27,6 @@ class Mechanism:
     """A robot with gravity, rotors and a point mass (payload) in its task frame; n independent joints.
 
     Args:
-        robot: the robot.
         gravity: in the root's axes, m/s².
         payload: the point mass, kg.
         offset: position of the payload in the task frame, m.

@@ -63,11 +63,6 @@ class Plant(ControlledPlant):
     Its variables are attributes (``ControlledPlant``). ``q`` and ``v`` are the state. Reading ``x``, ``xd``, ``tau``,
     ``der_q`` or ``der_v`` computes the value.
 
-    Args:
-        robot: the robot.
-        table: its variables.
-        control: the law, a key of ``CONTROLS``.
-
     Attributes:
         known: the robot as its control law knows it.
         time: time of the state, s.
@@ -134,7 +129,6 @@ class Plant(ControlledPlant):
         """Advance the state by one communication step of h seconds with inputs held.
 
         Args:
-            h: the step, s.
             time: time of the communication point at which the step begins, s; None: the plant's own time.
 
         Raises:

@@ -85,14 +85,9 @@ def apply_pseudo_inverse(
 
 
 def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
-    """Return the distance of the singular values next to a rank from rcond, as ratios to σ_max.
+    """Return the distance of the singular values next to a rank from rcond, as ratios to σ_max in descending order.
 
     It is negative if the rule σ > rcond·σ_max gives another rank.
-
-    Args:
-        ratios: σ/σ_max in descending order.
-        rcond: in [0, 1).
-        rank: rank of J⁺.
     """
     margins = [1.0]
     if rank > 0:

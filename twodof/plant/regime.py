@@ -53,12 +53,7 @@ class StepError(ArithmeticError):
 
 
 def fastest_joint(acceleration: Callable[[list[float]], Sequence[float]], y: list[float]) -> tuple[int, float]:
-    """Return the joint whose acceleration is most sensitive to its own state, and its rate of change, 1/s.
-
-    Args:
-        acceleration: q̈ at a state (q, v).
-        y: the state.
-    """
+    """Return the joint whose acceleration is most sensitive to its own state, and its rate of change, 1/s."""
     n, a = len(y) // 2, acceleration(y)
     rates = []
     for i, order in product(range(n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|

@@ -23,7 +23,6 @@ class Robot:
     """A fixed-base robot with n independent joints, and its task frame.
 
     Attributes:
-        name: the URDF's robot name.
         model: Pinocchio model of all joints that move, one coordinate each; its gravity is not
             used (see ``Mechanism``).
         coupling, offset: positions of the model's joints are ``coupling @ q + offset``; coupling is None, and the
@@ -92,7 +91,6 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     """Load a robot from the text of a URDF.
 
     Args:
-        text: XML text.
         frame: name of the link whose origin is the end effector.
         axes: one to three different letters of "xyz", the task's axes in the root frame.
 

@@ -58,7 +58,6 @@ def rosenbrock(
         mobility: M⁻¹ at y, n × n, with zero rows for joints at rest.
         damping: D, n values, N·m·s/rad or N·s/m.
         y: the state (q, v).
-        step: s.
         k1: ẏ at y.
         rtol, atol: tolerances of the state.
 

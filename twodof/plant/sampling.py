@@ -34,8 +34,6 @@ class Sampling:
 
     Attributes:
         start: t_0, s.
-        time: time of the latest sample, s.
-        k: number of samples so far.
         count: number of efforts that were commanded and do not act yet.
         q_meas, v_meas: the latest sample, n values each, rad or m, rad/s or m/s.
         effort: the effort that acts now, n values, N·m or N.
@@ -160,7 +158,6 @@ def sampling_refusal(plant: ControlledPlant, of_points: bool) -> str:
     """Return why the parameters of sampling are invalid, or "" if they are valid.
 
     Args:
-        plant: the plant.
         of_points: whether sensors without a control_period are sampled at communication points.
     """
     period, delay = plant.control_period, plant.control_delay

@@ -50,7 +50,6 @@ class Stops:
         rigid: whether stops have a reaction.
 
     Attributes:
-        rigid: whether stops have a reaction.
         rest: how each joint rests, or FREE.
         slip: direction in which each joint slips, −1 or 1; 0 without friction or at rest.
         held: joints at rest.

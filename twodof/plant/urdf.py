@@ -42,9 +42,7 @@ class Joint:
     """A joint of a URDF.
 
     Attributes:
-        name: its name.
         type: "fixed", "revolute", "continuous" or "prismatic".
-        parent, child: links.
         xyz, rpy: pose of its frame in the parent's frame at q = 0, m, and rad about the fixed axes x, y, z.
         axis: unit vector in the joint's frame.
         low, high: position limits, rad or m; ∓UNBOUNDED without limits.
@@ -88,7 +86,6 @@ class Urdf:
     """A robot as described by its URDF.
 
     Attributes:
-        name: name of the robot.
         root: the link without a parent.
         links: link names, in the order of the file.
         joints: joints by name, in the order of the file.
@@ -114,11 +111,7 @@ class Urdf:
 
 
 def check_axes(axes: str) -> None:
-    """Refuse invalid task axes.
-
-    Raises:
-        RobotError: they are not one to three different letters of "xyz".
-    """
+    """Refuse task axes that are not one to three different letters of "xyz"."""
     if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
         raise RobotError(f"axes '{axes}': expected one to three different letters of x, y, z")
 

@@ -56,7 +56,6 @@ class Variable:
             "parameter" (all parameters are fixed).
         unit: FMI unit name, or "".
         start: start value; None for computed variables.
-        description: one line.
         called: name of the vector in the FMU, where it is not the group's; "" else.
         shown: whether the FMU has it; a part of the plant's engine otherwise.
         columns: number of columns of a matrix, whose elements ``index`` counts row by row; 0 for other variables.
@@ -241,7 +240,6 @@ def variable_table(
         robot: the robot; n joints and m task axes give the vectors' lengths.
         starts: start values that differ from the defaults, by group. "q_start" (n values) is required, and so are
             "x_des" (m values) and "quat_des" (4 values) if the control law has them.
-        control: the control law, a key of ``CONTROLS``.
         outputs: groups of ``ON_REQUEST`` that the FMU has.
     """
     law = CONTROLS[control]

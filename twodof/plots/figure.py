@@ -104,9 +104,6 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     Args:
         output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the drawing's name and .png in
             the working directory, with a number if another file has that name.
-
-    Raises:
-        PlotError: the kind of file is unknown, or the file cannot be written.
     """
     path = Path(output) if output is not None else free_name(drawing.name, ".png", _is_ours)
     kind = file_kind(path)
@@ -117,11 +114,7 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
 
 
 def file_kind(path: str | Path) -> str:
-    """Return the kind of file by its name: "png", "svg", "pdf" or "html".
-
-    Raises:
-        PlotError: the kind is unknown.
-    """
+    """Return the kind of file by its name: "png", "svg", "pdf" or "html"."""
     kind = Path(path).suffix.lower().removeprefix(".")
     kind = kind or ("" if descriptor_of(path) is None else "png")
     if kind not in ("png", "svg", "pdf", "html"):

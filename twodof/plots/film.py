@@ -48,7 +48,6 @@ def film(
     """Write a bag as a film of 1280 × 720 pixels in real time, or the picture at its end.
 
     Args:
-        bag: the bag, or its folder.
         output: the file, written completely or not at all; its suffix, of ``FILMS`` or .png, selects the format.
         urdf, frame: the robot and its end effector, as in ``track.read_tracks``.
 

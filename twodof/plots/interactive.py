@@ -51,11 +51,7 @@ AXIS: dict[str, object] = {
 
 
 def body(tracks: Sequence[Track]) -> str:
-    """Return the HTML body of the page.
-
-    Raises:
-        PlotError: plotly is missing.
-    """
+    """Return the HTML body of the page."""
     over = over_time(tracks)
     content = {"figures": [over, *in_workspace(tracks)], "rows": _rows(tracks)}
     return f'{_verdicts(tracks)}<div id="plots"></div>\n{_thinned(tracks, over)}{figures_html(content)}'
@@ -65,9 +61,6 @@ def figures_html(content: object, name: str = "interactive.js") -> str:
     """Return the HTML with plotly's library and the content, both compressed, and the script that draws them.
 
     ``interactive.js`` draws figures, and the rows of their legend, into the page's element "plots".
-
-    Raises:
-        PlotError: plotly is missing.
     """
     with needing(PlotError, "plot into a page", "view"):
         from plotly.offline import get_plotlyjs

@@ -34,8 +34,6 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
     """Return the HTML of the interactive map; "" without plotly.
 
     Args:
-        table: table of the sweep.
-        varied: varied variables.
         bags: folder with a bag of each run, whose curves are shown when the run is clicked; None: none.
         best: initially selected run, if any.
     """

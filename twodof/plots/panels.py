@@ -64,11 +64,7 @@ def joint_names(tracks: Sequence[Track]) -> list[str]:
 
 
 def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
-    """Return the tracks with the named joints only, in that order.
-
-    Raises:
-        PlotError: no track has a joint of a given name.
-    """
+    """Return the tracks with the named joints only, in that order."""
     known = joint_names(tracks)
     for name in names:
         if name not in known:

@@ -71,13 +71,8 @@ def drawing(table: pandas.DataFrame, name: str, cost: Expression | None = None, 
     """Return the drawing of a sweep, given the result of ``read_sweep``.
 
     Args:
-        table: table of the sweep.
-        name: name of the sweep's folder.
         cost: cost by which the page ranks runs; None: rank by RANKED.
         bags: folder with a bag of each run, whose curves a page shows.
-
-    Raises:
-        PlotError: the sweep has no finished run.
     """
     provenance = table.attrs["provenance"]
     design = provenance["design"]

@@ -97,7 +97,6 @@ class Track:
     Attributes:
         settings: settings of the run as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
         t: time since the first sample, s, N values.
-        joints: joints in the bag's order.
         motion, task: motion of the links, and task; None if the robot is unknown, the task also without a target.
         linkage: the robot; None if unknown.
     """
@@ -250,11 +249,7 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
 
 
 def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: Array) -> Array:
-    """Return the columns of q or v for the linkage's joints; joints that do not move the frame have 0.
-
-    Raises:
-        PlotError: a joint that moves the frame is not in the bag.
-    """
+    """Return the columns of q or v for the linkage's joints; joints that do not move the frame have 0."""
     ordered = np.zeros((len(values), len(linkage.moving)))
     needed = {j.name if j.name in names else j.leader for j in linkage.chain}
     for j, joint in enumerate(linkage.moving):

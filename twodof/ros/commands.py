@@ -47,7 +47,6 @@ class Command(NamedTuple):
 
     Attributes:
         stamp: time stamp, ns since the epoch; 0 without one.
-        inputs: values of the FMU's inputs.
         unknown_joints: names of joints that the robot does not have.
     """
 
@@ -86,11 +85,7 @@ def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[
 
 
 def sized(part: Sequence[float], what: str, names: Sequence[str]) -> Sequence[float]:
-    """Check that a message has one number for each joint that it names; return the numbers.
-
-    Raises:
-        CommandError: the numbers of names and values differ.
-    """
+    """Check that a message has one number for each joint that it names; return the numbers."""
     if len(part) != len(names):
         raise CommandError("sizes", f"has {len(part)} {what} for {len(names)} joints")
     return part

@@ -76,7 +76,6 @@ class Listener:
     """Readers of commands, and of requests to pause and to step.
 
     Args:
-        follows: mapping from messages to the FMU's inputs.
         received: topics and types of commands.
         orders: receive /pause and /step.
         oldest: largest age of a joint command's stamp relative to the sample, s; None: any age.

@@ -91,11 +91,7 @@ def definition(kind: str) -> str:
 
 
 def check_name(argument: str, name: str) -> None:
-    """Refuse an invalid ROS 2 name.
-
-    Raises:
-        InputError: the name is invalid; the message names the argument.
-    """
+    """Refuse an invalid ROS 2 name."""
     if name and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
         raise InputError(f"`{argument}` '{name}' is not a valid ROS 2 name")
 
@@ -214,11 +210,7 @@ class Messages:
         return sum(layout.size for layout in self._layouts.values())
 
     def numbers(self, sample: Sample) -> bytes:
-        """Return the packed numbers of one sample's messages, which may be joined with those of other samples.
-
-        Raises:
-            struct.error: the sample does not belong to this run.
-        """
+        """Return the packed numbers of one sample's messages, which may be joined with those of other samples."""
         given = (*sample.signals, *sample.q_meas, *sample.v_meas) if self._measured else sample.signals
         given = (*given, *sample.tau) if self._efforts else given
         if self._scene is not None:

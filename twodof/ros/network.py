@@ -78,9 +78,6 @@ class Network(NamedTuple):
         Cyclone DDS listens on all addresses, whatever its interfaces, and answers any host that finds its ports.
         Therefore a kernel filter drops packets unless they come over the loopback interface, as all packets of this
         host do, or from a peer. Cyclone DDS sends only to hosts from which it has received packets.
-
-        Raises:
-            PublishError: the kernel refuses the filter.
         """
         before = _sockets()
         yield
@@ -150,9 +147,6 @@ def network_of_environment(variables: Mapping[str, str] = os.environ, *, subnet:
     The default range is LOCALHOST, not SUBNET as in ROS 2: nothing leaves the host without permission.
 
     With ``subnet``, the range is SUBNET, whatever the variables of the range are.
-
-    Raises:
-        PublishError: a variable is invalid; the message names it.
     """
     number = variables.get("ROS_DOMAIN_ID") or "0"
     if not re.fullmatch("[0-9]{1,9}", number) or int(number) > LAST_DOMAIN:

@@ -25,7 +25,6 @@ class Scene:
     Args:
         urdf: XML text whose meshes are named ``package://meshes/…``.
         joints: names of the joints, in the order of q.
-        frame: the end effector's link.
         read: returns the bytes of a mesh by its name ``meshes/…``, or None if it is missing.
         meshes_in: URI of the folder with meshes of these names, with a trailing slash; "": there is none.
 
@@ -33,9 +32,6 @@ class Scene:
         description: the URDF, in which the best-fitting box or cylinder replaces each mesh, so that it renders
             without mesh files; with ``meshes_in``, the URIs of the meshes instead.
         fixed, moving: joints with constant transforms, and the other joints.
-
-    Raises:
-        RobotError: the URDF is invalid.
     """
 
     def __init__(self, urdf: str, joints: Sequence[str], frame: str, read: ReadMesh, meshes_in: str = "") -> None:

@@ -35,7 +35,6 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     """Return the causes, the root first.
 
     Args:
-        judge: the judge of all samples.
         missed: outputs that are not at their targets: "x", "quat" or "q".
         motion: motion at the end of the run.
     """

@@ -77,7 +77,6 @@ def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
     """Yield loads, and the damping of joints, that the controller does not know.
 
     Args:
-        judge: the judge of all samples.
         slight: torque, relative to the largest effort, below which a load does not count.
     """
     switch, (payload, believed) = "payload_known", payloads(judge)

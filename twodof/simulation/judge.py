@@ -36,11 +36,9 @@ class Judge:
     each BLOCK rows.
 
     Args:
-        setup: the run's robot and settings.
         sizes: number of values of each of OUTPUTS in a row, 0 if the run lacks it.
 
     Attributes:
-        count: samples so far.
         inputs: present values of changed inputs.
         latest: last change of inputs that are no targets: time in s, and values before and after by name.
         aims: errors by output, for outputs with a target.

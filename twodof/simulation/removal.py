@@ -34,7 +34,6 @@ def by_removal(
     without the first cause follows.
 
     Args:
-        judge: the judge of the run.
         missed: outputs that are not at their targets.
         why: causes, the root first.
         repeat: function that repeats the run.

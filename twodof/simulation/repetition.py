@@ -39,7 +39,6 @@ class Repeater:
     """Repeats an experiment with other settings.
 
     Attributes:
-        run: the experiment.
         stop: called between steps; True ends the repetitions.
         left: wall time that they may still take, s.
     """

@@ -17,7 +17,6 @@ def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> It
     """Yield a cause for each output whose error still shrinks, with the remaining time by its rate.
 
     Args:
-        judge: the judge of all samples.
         missed: outputs that are not at their targets.
         static: magnitude of the error to which an output tends, as far as it is known.
     """
@@ -71,7 +70,6 @@ def unsettled(judge: Judge, moving: float, static: Mapping[str, float]) -> Itera
     """Yield the reason of an error that neither decays steadily nor lacks damping.
 
     Args:
-        judge: the judge of all samples.
         moving: part of the error that is motion.
         static: magnitude of the error to which an output tends, as far as it is known.
     """

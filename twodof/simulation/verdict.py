@@ -172,7 +172,6 @@ def conclude(judge: Judge, known: tuple[Cause, ...] = (), repeat: Repeat | None 
     """Return the verdict of a judge's samples.
 
     Args:
-        judge: the judge of all samples.
         known: causes that are known beforehand.
         repeat: function that repeats the run with other settings, if that is possible.
     """
@@ -202,7 +201,6 @@ def judged(
     """Return the verdict of N recorded samples.
 
     Args:
-        setup: the run's robot and settings.
         t: times since the first sample, s, N.
         values: q, v, x, tau and quat, N rows each; unknown ones have no columns.
         targets: targets of x, quat and q in effect up to each sample, N rows each; NaN before the first target.

@@ -21,7 +21,6 @@ class Batches:
     workers has the outcome "crashed".
 
     Args:
-        points: points of all runs.
         left: number of runs that have no row yet.
     """
 

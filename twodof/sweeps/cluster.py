@@ -64,8 +64,6 @@ class Cluster:
     A thread communicates with Dask, because Dask can wait without end for a peer that does not answer.
 
     Args:
-        job: common settings of all runs.
-        batches: the runs.
         address: address of the scheduler.
         stop: called repeatedly; True ends the sweep.
 

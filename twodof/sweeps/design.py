@@ -58,11 +58,7 @@ def make_design(
     seed: int,
     settings: Mapping[str, Setting],
 ) -> Design:
-    """Return the design, checked against the FMU and the other settings.
-
-    Raises:
-        InputError: a variable or number is invalid; the message names it.
-    """
+    """Return the design, checked against the FMU and the other settings."""
     grids, limits = {}, {}
     for name, values in grid.items():
         try:

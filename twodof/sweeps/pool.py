@@ -21,8 +21,6 @@ class Pool:
     """Worker processes, which are replaced when they die, as a context that needs at least one of them.
 
     Args:
-        job: common settings of all runs.
-        batches: the runs.
         count: number of processes.
         stop: called repeatedly; True ends the sweep.
 

@@ -57,11 +57,7 @@ def candidates(table: pandas.DataFrame) -> pandas.DataFrame:
 
 
 def cost_of(text: str | None) -> Expression | None:
-    """Return the expression of a cost of metrics, such as "settling + 0.1*peak_effort"; None for None.
-
-    Raises:
-        InputError: the text is not such an expression.
-    """
+    """Return the expression of a cost of metrics, such as "settling + 0.1*peak_effort"; None for None."""
     return None if text is None else expression(text, METRICS, condition=False)
 
 

@@ -39,10 +39,7 @@ class Results:
     """The table of a sweep in progress.
 
     Args:
-        path: the folder; without ``resume``, it must not exist.
         names, units: varied variables and their units.
-        runs: number of runs.
-        provenance: provenance of the numbers.
         resume: continue the sweep in the folder.
 
     Attributes:

@@ -37,7 +37,6 @@ class Job:
     Attributes:
         content: bytes of the FMU's file.
         file: name of the FMU's file.
-        names: varied variables.
         options: options of ``experiment``: stop_time, step, settings.
         bags: folder for a bag of each run; None: no bags.
     """
@@ -50,11 +49,7 @@ class Job:
 
 
 class Runner:
-    """Runs points of a job, as a context that frees the FMU at its end.
-
-    Raises:
-        InputError, FmuError: the job cannot be run.
-    """
+    """Runs points of a job, as a context that frees the FMU at its end."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
