@@ -25,6 +25,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import twodof
+from twodof.bag.reader import read_all_ends
 from twodof.simulation.experiments import Experiment
 from twodof.simulation.sample import Sample
 
@@ -83,6 +84,11 @@ class Logging(NamedTuple):
         """Return the age of the first lost sample at the time of the last one, s."""
         times = self.times
         return float(times[-1] - times[kept]) if kept < len(times) else 0.0
+
+
+def read_ends(path: str | Path) -> twodof.Recording:
+    """The first and the last joint state of a bag of one robot."""
+    return read_all_ends([Path(path)])[0]
 
 
 def logging(fmu: Path, bag: Path, storage: str) -> Logging:

@@ -26,6 +26,7 @@ from bags import (
     joint_message,
     joint_state,
     metadata,
+    read_ends,
     read_with_rosbags,
     serialised,
     write_third_party,
@@ -38,7 +39,6 @@ from ruamel.yaml import YAML
 from sinks import Collector
 
 import twodof
-from twodof.bag.reader import read_ends
 from twodof.bag.storage import McapStorage
 from twodof.errors import BagError, InputError
 from twodof.simulation.experiments import Experiment

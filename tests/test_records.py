@@ -31,6 +31,7 @@ from bags import (
     chunk,
     joint_message,
     message,
+    read_ends,
     record,
     sample,
     serialised,
@@ -40,7 +41,7 @@ from bags import (
 import twodof
 from twodof.bag import joint_states, reader, recording, sqlite
 from twodof.bag.contents import read_messages
-from twodof.bag.reader import read_bag, read_ends
+from twodof.bag.reader import read_bag
 from twodof.bag.records import DamageError, ReadBudget
 from twodof.cli.main import main
 from twodof.errors import BagError

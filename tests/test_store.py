@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bags import PERIOD, START, STORAGES
+from bags import PERIOD, START, STORAGES, read_ends
 from harness import wait_until
 from rosbags.rosbag2 import Reader
 
 import twodof
 from twodof.bag.provenance import robots_of
-from twodof.bag.reader import read_bag, read_ends
+from twodof.bag.reader import read_bag
 from twodof.bag.recovery import recover
 from twodof.cli.main import main
 from twodof.errors import BagError, InputError

@@ -9,14 +9,13 @@ from zlib import crc32
 
 import numpy as np
 import pytest
-from bags import START, joint_message, serialised
+from bags import START, joint_message, read_ends, serialised
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import twodof
 from twodof.bag.contents import read_messages
 from twodof.bag.mcap import CHANNEL
-from twodof.bag.reader import read_ends
 from twodof.bag.records import DamageError, ReadBudget
 from twodof.bag.summary import _chunk, read_summary
 from twodof.bounds import MAX_TOPICS

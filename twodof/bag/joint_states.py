@@ -107,7 +107,9 @@ class JointStates:
         self._odd += message.nbytes
         if self._odd > MAX_ODD:
             raise BagError(f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form")
-        frame, names, *parts = _deserialised(message.tobytes())
+        state: Any = store_of(JOINT_STATE).deserialize_cdr(message.tobytes(), JOINT_STATE)
+        frame, names = state.header.frame_id, tuple(state.name)
+        parts = [state.position, state.velocity, state.effort]
         sizes = tuple(map(len, parts))
         if not self._sizes:
             self._names, self._sizes = names, sizes
@@ -117,12 +119,6 @@ class JointStates:
         if sizes != self._sizes:
             raise MixtureError("sizes")
         return frame, parts
-
-
-def _deserialised(message: bytes) -> tuple[Any, ...]:
-    """Return frame, names, positions, velocities and efforts of a JointState."""
-    state: Any = store_of(JOINT_STATE).deserialize_cdr(message, JOINT_STATE)
-    return state.header.frame_id, tuple(state.name), state.position, state.velocity, state.effort
 
 
 class Ends(JointStates):

@@ -51,8 +51,9 @@ class OldBag:
         """Remove the old bag; if this fails, the next run that overwrites removes it."""
         if self._locks:
             with suppress(OSError):
-                for bag in (self._kept, *self._left):
-                    _remove(bag)
+                for bag in filter(Path.exists, (self._kept, *self._left)):
+                    with temporary_folder(bag.parent) as folder:  # which the next process removes if this one is killed
+                        bag.rename(folder / bag.name)
             self._release()
 
     def _release(self) -> None:
@@ -93,10 +94,3 @@ def _is_bag(path: Path) -> bool:
         return metadata.startswith(b"rosbag2_bagfile_information:")
     except OSError:
         return any(read_provenance(path, name) for name in robots_of(path))
-
-
-def _remove(bag: Path) -> None:
-    """Remove a bag, if there is one, at once; a process that is killed meanwhile leaves a temporary folder."""
-    if bag.exists():
-        with temporary_folder(bag.parent) as folder:
-            bag.rename(folder / bag.name)

@@ -51,11 +51,6 @@ def read_bags(paths: Sequence[str | Path]) -> list[Recording]:
     return _read([_Robot(Path(path), JointStates, Targets()) for path in paths])
 
 
-def read_ends(path: str | Path) -> Recording:
-    """Return the first and the last joint state of a bag, as ``read_all_ends`` does."""
-    return read_all_ends([Path(path)])[0]
-
-
 def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
     """Return the first and the last joint state of robots of one bag.
 

@@ -5,7 +5,7 @@ import os
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -99,13 +99,10 @@ class Store:
             self._parts.append(part)
             self._entered += 1
 
-    def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
-        """Add topics; return the numbers of their connections, in the same order."""
-        add = self.writer.add_connection
-        return [
-            add(name, kind, typestore=store_of(kind), offered_qos_profiles=[qos]).id
-            for name, (kind, qos) in topics.items()
-        ]
+    def add_topic(self, name: str, topic: Topic) -> int:
+        """Add a topic; return the number of its connection."""
+        store, profiles = store_of(topic.type), [topic.qos]
+        return self.writer.add_connection(name, topic.type, typestore=store, offered_qos_profiles=profiles).id
 
     def check(self) -> None:
         """Raise the error that ended the thread, if any; raise BagError if the bag is not open."""

@@ -175,8 +175,8 @@ class Bag(Sink):
             file = self._folder / name.removeprefix("resources/")
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(read(name.removeprefix("resources/")) or b"")
-        topics = {self._named(name): topic for name, topic in self._messages.topics.items()}
-        self._connections = dict(zip(self._messages.topics, self._store.add_topics(topics)))
+        add, topics = self._store.add_topic, self._messages.topics.items()
+        self._connections = {name: add(self._named(name), topic) for name, topic in topics}
 
     def hand_over(self) -> None:
         """Pass the queue to the store: changes of inputs first, then the messages that they affect."""

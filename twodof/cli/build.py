@@ -24,7 +24,6 @@ from .printing import busy, print_next, print_table, quote, say, written
 
 
 def add(build: Parser) -> None:
-    """Add the options of the verb."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu; - is the standard output", output_file)
     option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the shipped planar 2-DoF arm)")
@@ -80,7 +79,6 @@ def _add_native(build: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     if options.list_robots:
         from ..export.stock_robots import SOURCE, stock_robots
 

@@ -8,7 +8,6 @@ from .printing import busy, print_json, print_table, say
 
 
 def add(check: Parser) -> None:
-    """Add the options of the verb."""
     check.description = "Check an FMU of any vendor; exit status 1 if a row fails."
     check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0, or SSP file")
     tools, text = ("fmpy", "libcosim", "ecos", "fmuloader"), "run the FMU's references in this FMI tool too; repeatable"
@@ -17,7 +16,6 @@ def add(check: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..fmu.checking import check
 
     with busy("checking", silent=True):

@@ -9,7 +9,6 @@ from .printing import print_table, written
 
 
 def add(export: Parser) -> None:
-    """Add the options of the verb."""
     export.description = (
         "Write a bag as a table with named columns and units, as one MCAP file of all messages, or bags as the episodes"
         " of a LeRobot dataset."
@@ -20,7 +19,6 @@ def add(export: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..bag.exports import export_bag
 
     path = export_bag(options.bags, options.output)

@@ -16,7 +16,6 @@ from .printing import plain, print_json, print_next, print_table, quote, say
 
 
 def add(fit: Parser) -> None:
-    """Add the options of the verb."""
     fit.description = (
         "Fit masses, friction and other parameters of a URDF to bags with positions and efforts. Writes robot.urdf,"
         " fit.json and fit.html, a page with its curves, into a folder. The last fifth of each bag is held out."
@@ -43,7 +42,6 @@ def add(fit: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     if not options.free:
         raise CommandLineError("name the free parameters with --free, for example --free 'friction[*]' --free payload")
     if bool(options.bags) == (options.design is not None):

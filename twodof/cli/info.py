@@ -28,13 +28,11 @@ MOST_JUDGED = 200_000  # samples of up to 10 joints without a stored verdict, wh
 
 
 def add(info: Parser) -> None:
-    """Add the options of the verb."""
     info.add_argument("path", metavar="FMU|SSP|BAG|SWEEP", type=Path, help="FMU, system, bag or sweep to describe")
     add_options(info, "--robot", "--cost", "--json")
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     path = options.path
     folder = Path(str(path).rpartition(":")[0] or path)
     if not path.exists() and not folder.exists() and (near := neighbour(path, "FMU", "bag", "sweep")):

@@ -9,7 +9,6 @@ from .printing import print_next, print_table, quote
 
 
 def add(layouts: Parser) -> None:
-    """Add the options of the verb."""
     layouts.description = (
         "Write files in which RViz, PlotJuggler and Foxglove show a robot that is published, or"
         " recorded with --scene and --effort."
@@ -24,7 +23,6 @@ def add(layouts: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..ros.viewer_layouts import layouts
 
     chosen = chosen_fmu(options)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 
 def add(linearise: Parser) -> None:
-    """Add the options of the verb."""
     linearise.add_argument("fmu", metavar="FMU", help="native FMU")
     linearise.add_repeatable(
         "--at",
@@ -28,7 +27,6 @@ def add(linearise: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..linear import linearise
 
     (_print_json if options.json else _print)(linearise(options.fmu, parse_settings(options.at, "--at")))

@@ -11,7 +11,6 @@ from .view import address, open_page
 
 
 def add(live: Parser) -> None:
-    """Add the options of the verb."""
     live.description = "Step an FMU in real time behind a page in the browser: drag the target."
     add_fmu(live, "the default arm's", "FMU")
     add_output(live, "BAG", "name of recordings")
@@ -19,7 +18,6 @@ def add(live: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..pages.live_page import live
 
     settings = parse_settings(options.settings)

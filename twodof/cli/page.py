@@ -9,7 +9,6 @@ from .printing import busy, print_table, written
 
 
 def add(page: Parser) -> None:
-    """Add the options of the verb."""
     page.description = (
         "Write a native FMU as one HTML file: the robot in 3D, its plant running in the browser, a"
         " target to drag. It needs no network and no server."
@@ -20,7 +19,6 @@ def add(page: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..files import free_name
     from ..pages.arm import is_page, page
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 def add(plot: Parser) -> None:
-    """Add the options of the verb."""
     plot.description = (
         "Draw joint positions, velocities and efforts, the end effector's path and its error; of a"
         " sweep, each metric over the variables."
@@ -32,7 +31,6 @@ def add(plot: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..plots.figure import file_kind
 
     if options.output is not None:

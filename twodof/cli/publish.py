@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def add(publish: Parser) -> None:
-    """Add the options of the verb."""
     publish.description = (
         "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
         " Ctrl-C. Received commands drive the robot: joint states on /joint_commands, or points"
@@ -55,7 +54,6 @@ def add(publish: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..ros.messages import has_sensors
     from ..ros.network import network_of_environment
     from ..ros.realtime import PublisherOptions, publish_together

@@ -8,13 +8,11 @@ from .printing import print_next, print_table, quote, say
 
 
 def add(recover: Parser) -> None:
-    """Add the options of the verb."""
     recover.description = "Complete a bag whose writer died, so that every reader opens it."
     recover.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..bag.recovery import recover
 
     done = recover(options.bag)

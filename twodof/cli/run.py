@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 
 def add(run: Parser) -> None:
-    """Add the options of the verb."""
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "default: rosbag2_<date and time>")
     add_options(run, "--stop-time", "--step")
@@ -42,7 +41,6 @@ def add(run: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..simulation.expressions import expression
     from ..simulation.master import simulate
     from ..simulation.pace import RealTime

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 
 def add(sweep: Parser) -> None:
-    """Add the options of the verb."""
     sweep.description = (
         "Run an FMU over a grid or random values of any of its inputs and parameters. Without an FMU,"
         " the native FMU of the default arm is used."
@@ -59,7 +58,6 @@ def add(sweep: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     from ..simulation.progress import counting
     from ..sweeps.coordinator import sweep
     from ..sweeps.ranking import cost_of

@@ -12,7 +12,6 @@ from .signals import asked_to_stop
 
 
 def add(view: Parser) -> None:
-    """Add the options of the verb."""
     view.description = "Replay a bag in the browser, or write a page or a film that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
     text = "write a page (.html), a film (.mp4, .webp, .gif) or a picture (.png) instead; - is the standard output"
@@ -24,7 +23,6 @@ def add(view: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Run the verb; return the exit status."""
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
     from ..pages.replay import FILMS, export, view
 

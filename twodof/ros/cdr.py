@@ -115,7 +115,9 @@ def unpack_points(rows: Rows) -> tuple[bytes, Array]:
         MixtureError: the points are in different frames.
         IndexError, struct.error: a message is damaged.
     """
-    order, end = _header(rows[0].tobytes())
+    message = rows[0].tobytes()
+    order = "<" if message[1] else ">"
+    end = FRAME + int(struct.unpack_from(f"{order}I", message, FRAME - 4)[0])
     start = end + _gap(8, end)
     if start + 24 > rows.shape[1]:
         raise struct.error
@@ -127,12 +129,6 @@ def unpack_points(rows: Rows) -> tuple[bytes, Array]:
         return each[0][0], np.concatenate([point for _, point in each])
     points = np.ascontiguousarray(rows[:, start : start + 24]).view(f"{order}f8")
     return rows[0, FRAME:end].tobytes().rstrip(b"\0"), points.astype(np.float64)
-
-
-def _header(message: bytes) -> tuple[str, int]:
-    """Return the byte order as a format letter of ``struct``, and the end of the frame_id."""
-    order = "<" if message[1] else ">"
-    return order, FRAME + int(struct.unpack_from(f"{order}I", message, FRAME - 4)[0])
 
 
 def _gap(size: int, end: int) -> int:

@@ -92,7 +92,9 @@ def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement]
     if vertices is None:
         return None
     candidates = []
-    for rotation in (np.eye(3), _principal_axes(vertices)):
+    _, axes = np.linalg.eigh(np.cov(vertices.T))
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])  # right-handed
+    for rotation in (np.eye(3), axes):
         local = vertices @ rotation
         low, high = local.min(axis=0), local.max(axis=0)
         size, centre = high - low, (low + high) / 2
@@ -111,12 +113,6 @@ def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement]
         return ET.Element("box", size=_text(size)), placement
     radius, length = (repr(float(value)) for value in size)
     return ET.Element("cylinder", radius=radius, length=length), placement
-
-
-def _principal_axes(vertices: Array) -> Array:
-    _, axes = np.linalg.eigh(np.cov(vertices.T))
-    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])  # right-handed
-    return np.asarray(axes, dtype=np.float64)
 
 
 def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
