@@ -6,7 +6,6 @@ Spans grow by doubling, so that the extremes of a longer span are among those of
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +39,7 @@ class Downsampler:
         return chosen
 
 
-def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
+def extremes(parts: NDArray[np.int64], lines: Sequence[Array]) -> Indices:
     """Return the first and the last sample of each part, and the samples at which a line has an extreme.
 
     ``parts`` has the ascending part numbers of N samples, all ≥ 0. Values that are not finite are ignored.

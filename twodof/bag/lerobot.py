@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,12 +41,12 @@ def write_dataset(runs: Sequence[Recording], path: Path) -> None:
             raise BagError(f"'{run.path}' and '{runs[0].path}' differ in joints, target or rate")
     (names, rate), tables, episodes, end = known[0], [], [], 0
     for i, run in enumerate(runs):
-        tables.append(_frames(pd, run, rate, i, end))
+        tables.append(_frames(run, rate, i, end))
         span = {"dataset_from_index": end, "dataset_to_index": (end := end + len(run.t)), "length": len(run.t)}
         stats = {f"stats/{name}/{key}": v for name, own in _statistics(tables[-1]).items() for key, v in own.items()}
         episodes.append({"episode_index": i, "tasks": [TASK], **span, **PLACE, **stats})
     frames = pd.concat(tables, ignore_index=True)
-    features: dict[str, dict[str, Any]] = {
+    features: dict[str, dict[str, object]] = {
         name: {"dtype": str(np.asarray(frames[name][0]).dtype), "shape": [1], "names": None} for name in frames
     }
     features |= {part: {"dtype": "float32", "shape": [len(own)], "names": own} for part, own in names.items()}
@@ -95,7 +95,9 @@ def _rate(run: Recording) -> int:
     return rate
 
 
-def _frames(pd: Any, run: Recording, rate: int, episode: int, first: int) -> pd.DataFrame:
+def _frames(run: Recording, rate: int, episode: int, first: int) -> pd.DataFrame:
+    import pandas as pd
+
     k = np.arange(len(run.t))
     vectors = {part: [*np.column_stack([*own.values()]).astype(np.float32)] for part, own in _vectors(run).items()}
     times = {"timestamp": (k / rate).astype(np.float32), "frame_index": k, "episode_index": np.full(len(k), episode)}

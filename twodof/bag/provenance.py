@@ -73,8 +73,8 @@ class Provenance(TypedDict, total=False):
     command_line: str
     urdf: str | None
     signals: list[str]
-    system: dict[str, Any]
-    input_changes: list[list[Any]]
+    system: dict[str, object]
+    input_changes: list[tuple[float, dict[str, Value]]]
     inputs_known_until: float
     commanders: list[object]
     verdict: dict[str, Any]

@@ -7,7 +7,6 @@ import pwd
 import stat
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from ..errors import BuildError
 from ..files import names_of
@@ -41,7 +40,8 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
         say("the Python flavour is for Linux x86-64: building the native one", error=True)
     if not of_urdf:
         return _default_arm(options.verb, native=native)
-    return _built(getattr(options, "overwrite", False), urdf=Path(options.fmu), frame=options.frame, native=native)
+    overwrite = getattr(options, "overwrite", False)
+    return _built(Path(options.fmu), options.frame, native=native, overwrite=overwrite)
 
 
 def fast_fmu(options: argparse.Namespace) -> Path:
@@ -73,13 +73,13 @@ def _default_arm(verb: str, *, native: bool = False) -> Path:
     return path
 
 
-def _built(overwrite: bool = False, **what: Any) -> Path:
-    robot = what["urdf"].name if what.get("urdf") else "the default arm"
+def _built(urdf: Path | None = None, frame: str | None = None, *, native: bool, overwrite: bool = False) -> Path:
+    robot = urdf.name if urdf else "the default arm"
     with busy(f"building the FMU of {robot}; a compiler may take a minute"):
         from ..export.fmu_options import FmuOptions
         from ..export.package import build_fmu
 
-        path = build_fmu(None, FmuOptions(**what), overwrite=overwrite)
+        path = build_fmu(None, FmuOptions(urdf=urdf, frame=frame, native=native), overwrite=overwrite)
     _check_own(path)
     return path
 

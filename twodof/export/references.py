@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from ..errors import BuildError
+from ..plant.equations import Equations
 from ..plant.plant import Plant
 from ..plant.robot import Robot
 from ..plant.variables import OF_LINKS, ON_REQUEST, Variable
@@ -184,7 +184,7 @@ def _solve(
             raise BuildError("no references: the robot passes a singular pose near its start; choose another `q_start`")
         rank = kept
 
-        def rates(t: float, y: Array, equations: Any = equations) -> Array:
+        def rates(t: float, y: Array, equations: Equations = equations) -> Array:
             return np.concatenate([y[n:], equations.acceleration(y[:n], y[n:], None, [0] * n)[0]])
 
         start = np.array([*plant.q, *plant.v])

@@ -53,7 +53,7 @@ class Variables(Protocol):
         """Return the type of a variable."""
 
 
-def vector(variables: Mapping[str, Any], group: str) -> list[str]:
+def vector(variables: Mapping[str, object], group: str) -> list[str]:
     """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
     if group in variables:
         return [group]

@@ -11,14 +11,13 @@ import io
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any
 
 from ..bounds import MAX_XACRO_MEMORY, MAX_XACRO_SECONDS, MAX_XACRO_WAIT
 from ..children import Child, confine, limit_time
@@ -143,10 +142,10 @@ def _package(name: str, folders: Sequence[Path]) -> Path:
     raise ValueError(f"package '{name}' not found in {where}; give the folder of the packages with `mesh_dir`")
 
 
-def _guard(folders: Sequence[Path], most: int) -> Any:
+def _guard(folders: Sequence[Path], most: int) -> Callable[[str, tuple[str, ...]], None]:
     """Install an audit hook that allows reading files in the folders, and no other system access."""
 
-    def guard(event: str, arguments: tuple[Any, ...]) -> None:
+    def guard(event: str, arguments: tuple[str, ...]) -> None:
         if event in ("glob.glob", "open", "os.listdir", "os.scandir"):
             path = Path(os.path.realpath(arguments[0]))
             if not any(path.is_relative_to(folder) for folder in folders):

@@ -13,7 +13,7 @@ import posixpath
 import zipfile
 from array import array
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
@@ -35,7 +35,7 @@ TIME_TOLERANCE = 1e-6  # fraction of a communication step
 TRUTHS = {"true": "1", "false": "0"}
 MOST_STEPS = 1_000_000
 Values = dict[str, float | bool | int]
-KINDS: dict[str, Callable[[Any], float | bool]] = {"Real": float, "Integer": int, "Boolean": bool}
+KINDS: dict[str, Callable[[float], float | bool]] = {"Real": float, "Integer": int, "Boolean": bool}
 """Types of values, and functions that convert numbers to them."""
 Table = tuple[list[str], NDArray[np.float64]]
 

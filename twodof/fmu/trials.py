@@ -12,7 +12,6 @@ from contextlib import suppress
 from functools import partial
 from itertools import accumulate
 from math import inf, isfinite
-from typing import Any
 
 from fmpy.model_description import Unknown
 
@@ -142,7 +141,7 @@ def serialised_state(trial: Trial) -> str:
         return _restored(trial, instance, instance.slave.deserializeFMUState(content), rows) + " in a new instance"
 
 
-def _saved(trial: Trial, instance: Instance) -> tuple[Any, list[Outputs]]:
+def _saved(trial: Trial, instance: Instance) -> tuple[object, list[Outputs]]:
     """Return the state after half of the steps, and the outputs then and after each further step."""
     trial.require_outputs()
     half = trial.steps // 2
@@ -153,7 +152,7 @@ def _saved(trial: Trial, instance: Instance) -> tuple[Any, list[Outputs]]:
     return saved, [before, *trial.rows(instance, half, half)]
 
 
-def _restored(trial: Trial, instance: Instance, saved: Any, rows: Sequence[Outputs]) -> str:
+def _restored(trial: Trial, instance: Instance, saved: object, rows: Sequence[Outputs]) -> str:
     """Restore and free a state, and compare the outputs with those after it was saved."""
     half = trial.steps // 2
     trial.note("restoring the state")

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from ..plant.urdf import INERTIA
 
 Array = NDArray[np.float64]
+Numbers = NDArray[Any]
+"""Real numbers, or complex ones for derivatives."""
 
 
-def inertia_of(second: NDArray[Any]) -> NDArray[Any]:
+def inertia_of(second: Numbers) -> Numbers:
     """Return the inertia of second moments of mass Σ: tr(Σ) 1 − Σ."""
     return np.asarray(np.trace(second) * np.eye(3) - second)
 
@@ -23,7 +25,7 @@ def second_moments(inertia: Array) -> Array:
     return np.asarray(0.5 * np.trace(inertia) * np.eye(3) - inertia)
 
 
-def dynamic_parameters(mass: Any, com: Any, second: Any, R: Array, p: Array) -> NDArray[Any]:
+def dynamic_parameters(mass: Numbers, com: Numbers, second: Numbers, R: Array, p: Array) -> Numbers:
     """Return m, m c and the inertia about the origin of a body that is placed in another frame."""
     c = R @ com + p
     about_origin = inertia_of(R @ second @ R.T + mass * np.outer(c, c))

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, choice
 from ..plant.robot import Robot, moving_links
 from ..plant.urdf import INERTIA, Urdf
-from .inertials import dynamic_parameters, inertia_of, second_moments
+from .inertials import Numbers, dynamic_parameters, inertia_of, second_moments
 
 Array = NDArray[np.float64]
 OF_JOINTS = {
@@ -70,17 +70,17 @@ class Values:
         gravity: m/s², root frame, 3.
     """
 
-    friction: Any
-    damping: Any
-    armature: Any
-    offset: Any
-    gain: Any
-    mass: Any
-    com: Any
-    second: Any
-    payload: Any
-    payload_com: Any
-    gravity: Any
+    friction: Numbers
+    damping: Numbers
+    armature: Numbers
+    offset: Numbers
+    gain: Numbers
+    mass: Numbers
+    com: Numbers
+    second: Numbers
+    payload: Numbers
+    payload_com: Numbers
+    gravity: Numbers
 
     def copy(self, kind: type) -> Values:
         """Return a copy with numbers of a type, float or complex."""
@@ -96,13 +96,13 @@ class Dynamics(NamedTuple):
         friction, damping, armature, offset, gain, gravity: as in ``Values``.
     """
 
-    inertial: Any
-    friction: Any
-    damping: Any
-    armature: Any
-    offset: Any
-    gain: Any
-    gravity: Any
+    inertial: Numbers
+    friction: Numbers
+    damping: Numbers
+    armature: Numbers
+    offset: Numbers
+    gain: Numbers
+    gravity: Numbers
 
 
 class Free(NamedTuple):
@@ -118,9 +118,9 @@ class Free(NamedTuple):
         """Number of coordinates."""
         return SIZES.get(self.group, 1)
 
-    def of(self, values: Values) -> Any:
+    def of(self, values: Values) -> Numbers:
         """Return a view of its values; for an inertia, of the second moments of mass."""
-        whole = getattr(values, "second" if self.group == "inertia" else self.group)
+        whole: Numbers = getattr(values, "second" if self.group == "inertia" else self.group)
         return whole if self.group in OF_THE_ROBOT else whole[self.place, ...]
 
 
@@ -268,7 +268,7 @@ class Parameters:
         own = SCALES[free.group] if free.group in SCALES else typical[free.group][free.place]
         return np.full(free.size, float(own))
 
-    def values(self, x: NDArray[Any]) -> Values:
+    def values(self, x: Numbers) -> Values:
         """Return the physical values at coordinates, which may be complex for derivatives."""
         values, place = self.start.copy(x.dtype.type), 0
         for free in self.free:
@@ -276,7 +276,7 @@ class Parameters:
             place += free.size
         return values
 
-    def _set(self, free: Free, own: NDArray[Any], part: NDArray[Any]) -> None:
+    def _set(self, free: Free, own: Numbers, part: Numbers) -> None:
         """Set the values of a parameter from its coordinates."""
         if free.group in EXPONENTS:
             own[...] = np.exp(part[0])
@@ -293,7 +293,7 @@ class Parameters:
         else:
             own[...] = part if own.ndim else part[0]
 
-    def reported(self, values: Values) -> NDArray[Any]:
+    def reported(self, values: Values) -> Numbers:
         """Return the values of the named parameters."""
         return np.concatenate([_reported(free.of(values)) for free in self.free])
 
@@ -306,7 +306,7 @@ class Parameters:
                 out[10 * body : 10 * body + 10] += ten
         return Dynamics(out, *(getattr(values, field) for field in Dynamics._fields[1:]))
 
-    def _ten(self, values: Values, link: int | None) -> tuple[int, NDArray[Any]]:
+    def _ten(self, values: Values, link: int | None) -> tuple[int, Numbers]:
         """Return the body and the ten dynamic parameters of a link, or of the payload, in the frame of its joint."""
         if link is None:
             (body, place), own = self._end, (values.payload[0], values.payload_com, np.zeros((3, 3)))
@@ -340,7 +340,7 @@ class Parameters:
         return reported, rates
 
 
-def _reported(own: NDArray[Any]) -> NDArray[Any]:
+def _reported(own: Numbers) -> Numbers:
     """Return the named values of a parameter; of second moments of mass, those of the inertia."""
     return np.array([inertia_of(own)[place] for place in INERTIA.values()]) if own.ndim == 2 else own.ravel()
 

@@ -23,13 +23,13 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from itertools import count, permutations
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
 
 from ..errors import PageError
 from ..version import needing
 
 with needing(PageError, "show a page", "view"):
     from websockets.asyncio.client import connect
+    from websockets.asyncio.connection import Connection as Peer
     from websockets.asyncio.server import ServerConnection, serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
@@ -245,7 +245,7 @@ async def relay(address: tuple[str, int], key: bytes, connection: Connection) ->
         url, sock=inner, subprotocols=protocols, compression=None, max_size=None, proxy=None, logger=_silent
     ) as other:
 
-        async def pump(source: Any, sink: Any) -> None:
+        async def pump(source: Peer, sink: Peer) -> None:
             with suppress(ConnectionClosed):
                 async for message in source:
                     await sink.send(message)

@@ -8,7 +8,6 @@ Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2; M_all
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -48,7 +47,7 @@ class Mechanism:
         self._G, self._c = robot.coupling, robot.offset
         self._still = np.zeros(model.nv)
         # both are views that Pinocchio updates
-        self._placement: Any = self._data.oMf[self._frame]
+        self._placement: pin.SE3 = self._data.oMf[self._frame]
         self._position: Array = self._placement.translation
 
     def observe(self, q: Array, v: Array) -> tuple[list[float], list[list[float]], list[float]]:

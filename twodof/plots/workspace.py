@@ -1,7 +1,7 @@
 """Lines of the arm in its workspace: start, end, path, targets and reach."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,10 +68,6 @@ def _view(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyl
     return View("".join("xyz"[axis] for axis in plane), tuple(strokes), *limits)
 
 
-def _stroke(label: str, track: int | None, points: Array, *line: Any, **more: Any) -> Stroke:
-    return Stroke(label, track, *points.T, *line, **more)
-
-
 def _arms(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyles) -> Iterator[Stroke]:
     """Return the arms at the start, with equal ones drawn once, and at the end.
 
@@ -86,17 +82,17 @@ def _arms(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyl
         if not any(np.array_equal(start, other) for other in starts):
             starts.append(start)
             label, owner = "arm at the start", i if alone else None
-            yield _stroke(label, owner, start[:, plane], PALE, 3.5, mark="o", depth=2.5)
+            yield Stroke(label, owner, start[:, plane[0]], start[:, plane[1]], PALE, 3.5, mark="o", depth=2.5)
         width = 3.5 if alone else 5.0 - 3.5 * i / (len(tracks) - 1)
         colour = GREY if alone else line_styles[i, ""].colour
-        yield _stroke("arm at the end", i, end[:, plane], colour, width, mark="o", depth=3.0)
+        yield Stroke("arm at the end", i, end[:, plane[0]], end[:, plane[1]], colour, width, mark="o", depth=3.0)
 
 
 def _paths(plane: tuple[int, int], tracks: Sequence[Track], line_styles: LineStyles) -> Iterator[Stroke]:
     for i, track in enumerate(tracks):
         if track.motion is not None:
             path, line = _drawable(track.motion.path[:, plane]), line_styles[i, ""]
-            yield _stroke("path", i, path, line.colour, CURVE, line.dashes)
+            yield Stroke("path", i, path[:, 0], path[:, 1], line.colour, CURVE, line.dashes)
         if track.task:
             yield _target(plane, i, track.task)
         for cause in track.verdict.causes if track.motion is not None else ():
@@ -114,7 +110,8 @@ def _target(plane: tuple[int, int], i: int, task: Task) -> Stroke:
     if len(x) != len(y):  # a line across the picture, because the other axis is not controlled
         return Stroke("target", i, x[-MANY_TARGETS:], y[-MANY_TARGETS:], INK, THIN, depth=5.0)
     if len(x) > MANY_TARGETS:
-        return _stroke("target", i, _drawable(np.column_stack([x, y])), INK, THIN, depth=5.0)
+        points = _drawable(np.column_stack([x, y]))
+        return Stroke("target", i, points[:, 0], points[:, 1], INK, THIN, depth=5.0)
     return Stroke("target", i, x, y, INK, 0.0, mark="+", depth=5.0)
 
 
@@ -128,16 +125,9 @@ def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
         if reach and reach.normal not in plane:
             centre = reach.centre[list(plane)]
             key = tuple(np.round([*centre, reach.radius], 9))
-            circles[key] = _stroke(
-                f"reach {reach.radius:.3g} m",
-                None,
-                centre + reach.radius * circle,
-                GREY,
-                THIN,
-                (6, 4),
-                depth=2.0,
-                framed=False,
-            )
+            x, y = (centre + reach.radius * circle).T
+            label = f"reach {reach.radius:.3g} m"
+            circles[key] = Stroke(label, None, x, y, GREY, THIN, (6, 4), depth=2.0, framed=False)
     return list(circles.values())
 
 

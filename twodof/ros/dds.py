@@ -31,11 +31,11 @@ SERIALISED = {
 
 
 @functools.cache
-def dds_type(name: str) -> Any:
+def dds_type(name: str) -> type:
     """Return the DDS type of a ROS 2 message type, named as rosidl_generator_dds_idl names it."""
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
-    struct = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
+    struct: type = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
     for name, method in SERIALISED.items():  # not a base class, which would be part of the type
         setattr(struct, name, method)
     return struct

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from ipaddress import ip_address
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from ..errors import PublishError
@@ -195,7 +195,7 @@ class OpenDomain(NamedTuple):
 
     network: Network
     interface: str
-    handle: Any
+    handle: domain.Domain
 
 
 def open_domain(network: Network) -> OpenDomain:
@@ -227,7 +227,7 @@ def open_domain(network: Network) -> OpenDomain:
     return OpenDomain(network, interfaces, opened)
 
 
-def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
+def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[domain.Domain | None, dict[str, str], str]:
     """Return a domain or None, the addresses of the interfaces in use by name, and the error.
 
     Cyclone DDS reports interfaces only in its trace, and the reason for a failure only on the standard error.

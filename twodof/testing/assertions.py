@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 from zlib import crc32
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _recording(run: Recording | str | Path) -> Recording:
     return read_bag(run) if isinstance(run, str | Path) else run
 
 
-def _fail(bag: Recording, text: str, curves: Sequence[Any], label: str = "") -> NoReturn:
+def _fail(bag: Recording, text: str, curves: Sequence[Array], label: str = "") -> NoReturn:
     """Raise the assertion's error, with the plot's path."""
     __tracebackhide__ = True
     if REPORT and curves:

@@ -5,13 +5,21 @@ pytest loads it in every run; therefore it imports the package only when a fixtu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import pytest
 
 from .assertions import REPORT
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from ..bag.recording import Recording
+    from ..fmu import Fmu
+    from ..fmu.checking import Check
+    from ..simulation.experiments import Experiment, ExperimentOptions
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -27,13 +35,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture
-def run_fmu(tmp_path: Path) -> Callable[..., Any]:
+def run_fmu(tmp_path: Path) -> Callable[..., Recording]:
     """Return a function that runs an FMU, writes a bag and returns its ``Recording``; keywords as in ``twodof.run``.
 
     The bag has efforts if the FMU has outputs tau[i].
     """
 
-    def run(fmu: str | Path, **options: Any) -> Any:
+    def run(fmu: Experiment | Fmu | str | Path, **options: Unpack[ExperimentOptions]) -> Recording:
         import twodof
 
         bag = tmp_path / f"run{len(list(tmp_path.glob('run*')))}"
@@ -46,13 +54,13 @@ def run_fmu(tmp_path: Path) -> Callable[..., Any]:
 
 
 @pytest.fixture
-def check_fmu() -> Callable[..., Any]:
+def check_fmu() -> Callable[..., Check]:
     """Return a function that checks an FMU by ``twodof.check``, and fails with the failed rows."""
 
-    def check(fmu: str | Path, **options: Any) -> Any:
+    def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
         import twodof
 
-        found = twodof.check(fmu, **options)
+        found = twodof.check(fmu, tools=tools)
         failed = [f"{row.name}: {row.text}" for row in found.rows if row.outcome == "failed"]
         if failed:
             pytest.fail(f"'{fmu}' fails\n" + "\n".join(failed), pytrace=False)
