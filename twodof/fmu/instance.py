@@ -105,7 +105,7 @@ class Instance:
             NAMES.discard(self._name)
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
 
-    def _instantiate(self, **what: str) -> Any:
+    def _instantiate(self, **what: str) -> fmi2.FMU2Slave:
         from fmpy.logging import addLoggerProxy  # missing on aarch64-linux, for which FMI 2.0 has no name
 
         with _loading():
@@ -155,7 +155,7 @@ class Instance:
 
     def set(self, values: Mapping[str, float | bool | str]) -> None:
         """Set variables by name; other elements of a vector keep their last values."""
-        changed: dict[tuple[str, int], list[Any]] = {}
+        changed: dict[tuple[str, int], list[object]] = {}
         for name, value in values.items():
             variable = self.fmu.variables[name]
             key = variable.type, variable.reference
@@ -331,7 +331,7 @@ LOGGER = fmi2.fmi2CallbackLoggerTYPE(_pass_on)
 class Instance3(Instance):
     """An instance of FMI 3.0."""
 
-    def _instantiate(self, **what: str) -> Any:
+    def _instantiate(self, **what: str) -> fmi3.FMU3Slave:
         with _loading():
             slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=lambda _environment, *message: self.log(*message), loggingOn=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-from typing import Any
 
 import lxml.etree
 import numpy as np
@@ -51,7 +50,7 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
     return f"{declaration[0] if declaration else ''}{written.rstrip()}\n".encode()
 
 
-def parsed(text: str) -> Any:
+def parsed(text: str) -> lxml.etree.ElementTree:
     """Return the tree of a URDF, in which numbers can be replaced.
 
     Raises:
@@ -64,7 +63,7 @@ def parsed(text: str) -> Any:
         raise InputError(f"the URDF cannot be written with fitted values: {error.msg}") from error
 
 
-def _write_link(inertial: Any, group: str, link: int, values: Values) -> None:
+def _write_link(inertial: lxml.etree.Element, group: str, link: int, values: Values) -> None:
     place = inertial_place(inertial)
     if group == "mass":
         inertial.find("mass").set("value", _number(values.mass[link]))
@@ -77,7 +76,7 @@ def _write_link(inertial: Any, group: str, link: int, values: Values) -> None:
             inertial.find("inertia").set(key, _number(tensor[index]))
 
 
-def _child(element: Any, tag: str, *, first: bool = False) -> Any:
+def _child(element: lxml.etree.Element, tag: str, *, first: bool = False) -> lxml.etree.Element:
     """Return an element's child with a tag; if it is missing, make it with the indentation of the others."""
     found = element.find(tag)
     if found is None:

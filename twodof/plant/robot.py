@@ -8,7 +8,6 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -170,7 +169,7 @@ def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], li
     return names, bodies, places, inertias
 
 
-def inertial_place(inertial: Any) -> pin.SE3:
+def inertial_place(inertial: ET.Element) -> pin.SE3:
     """Return the pose of an <inertial> element's frame in its link's frame."""
     origin = inertial.find("origin")
     xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))

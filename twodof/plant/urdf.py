@@ -8,7 +8,6 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from .numerals import number
 
@@ -207,6 +206,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
         raise RobotError(f"joint '{name}': its axis is zero")
     x, y, z = (component / length for component in axis)
     origin = element.find("origin")
+    leader, ratio, offset = _mimicry(name, None if kind == "fixed" else element.find("mimic"))
     return Joint(
         name=name,
         type=kind,
@@ -221,25 +221,25 @@ def _joint(name: str, element: ET.Element) -> Joint:
         velocity=velocity if velocity > 0.0 else math.inf,
         damping=damping,
         friction=friction,
-        **_mimicry(name, element if kind != "fixed" else None),
+        leader=leader,
+        ratio=ratio,
+        offset=offset,
     )
 
 
-def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
-    """Return the fields leader, ratio and offset by a joint's <mimic>; without one, the joint is its own leader."""
-    mimic = None if element is None else element.find("mimic")
+def _mimicry(name: str, mimic: ET.Element | None) -> tuple[str, float, float]:
+    """Return leader, ratio and offset by a joint's <mimic>; without one, the joint is its own leader."""
     if mimic is None:
-        return {"leader": name}
-    factors = {"ratio": ("multiplier", "1"), "offset": ("offset", "0")}
+        return name, 1.0, 0.0
     try:
-        read = {field: number(mimic.get(*key).strip()) for field, key in factors.items()}
+        ratio, offset = (number(mimic.get(*key).strip()) for key in (("multiplier", "1"), ("offset", "0")))
     except ValueError:
-        read = {"ratio": math.inf}
-    if not all(abs(value) <= LARGEST for value in read.values()):
+        ratio = offset = math.inf
+    if not (abs(ratio) <= LARGEST and abs(offset) <= LARGEST):
         raise RobotError(f"joint '{name}': its <mimic> has a factor or offset that is not a number")
     if mimic.get("joint") == name:
         raise RobotError(f"joint '{name}' mimics itself")
-    return {"leader": mimic.get("joint", ""), **read}
+    return mimic.get("joint", ""), ratio, offset
 
 
 def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:

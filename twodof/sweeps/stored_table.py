@@ -27,7 +27,7 @@ with needing(SweepError, "read or write tables of sweeps", "sweep"):
 WHOLE = "runs.parquet"
 PART = re.compile(r"part-(\d{6,})\.parquet")
 KEY = b"twodof"
-SHAPE: dict[str, Any] = {
+SHAPE = {
     "fmu": {"file": str, "name": str, "guid": str},
     "design": {"grids": {str: [NUMBER]}, "ranges": {str: [NUMBER]}, "draws": int},
     "options": {"stop_time": NUMBER, "step": NUMBER, "settings": VALUES},
@@ -164,7 +164,7 @@ def provenance_in(file: Path, schema: pa.Schema) -> dict[str, Any]:
         names = [
             *varied,
             *settings,
-            *(provenance["fmu"][key] for key in SHAPE["fmu"]),
+            *(provenance["fmu"][key] for key in ("file", "name", "guid")),
             provenance["versions"]["twodof"],
         ]
         if max(map(len, names)) > MAX_NAME:
