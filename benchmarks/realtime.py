@@ -71,9 +71,8 @@ def receive() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from twodof.ros.dds import dds_qos, dds_type
     from twodof.ros.messages import JOINT_STATE, STREAM
-    from twodof.ros.network import Network, open_domain
+    from twodof.ros.network import Network, dds_qos, dds_type, open_domain
 
     _domain = open_domain(Network(DOMAIN, loopback=True))
     participant = DomainParticipant(DOMAIN)

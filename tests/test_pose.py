@@ -295,7 +295,7 @@ import numpy as np
 from twodof.ros.cdr import Layout, Numbers, Stamp
 from twodof.ros.messages import POSE, STREAM
 from twodof.ros.network import network_of_environment, open_domain
-from twodof.ros.dds import dds_qos, dds_type
+from twodof.ros.network import dds_qos, dds_type
 
 domain = open_domain(network_of_environment())
 participant = DomainParticipant(network_of_environment().domain)

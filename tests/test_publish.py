@@ -302,7 +302,7 @@ from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from twodof.ros.messages import STREAM
-from twodof.ros.dds import dds_qos, dds_type
+from twodof.ros.network import dds_qos, dds_type
 
 number, configuration = int(sys.argv[1]), sys.argv[2]
 domain = Domain(number, f"<CycloneDDS><Domain>{configuration}</Domain></CycloneDDS>")

@@ -22,10 +22,9 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 
 import twodof
-from twodof.ros.dds import dds_qos, dds_topic
 from twodof.ros.listener import Commanders
 from twodof.ros.messages import POINT, STREAM
-from twodof.ros.network import Network, open_domain
+from twodof.ros.network import Network, dds_qos, dds_topic, open_domain
 
 FOREIGN = """
 import sys, time
@@ -34,7 +33,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from rosbags.typesys import Stores, get_typestore
-from twodof.ros.dds import dds_qos, dds_type
+from twodof.ros.network import dds_qos, dds_type
 from twodof.ros.messages import POINT, STREAM
 
 number, peer = int(sys.argv[1]), sys.argv[2]

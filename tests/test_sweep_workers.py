@@ -23,7 +23,7 @@ from tools import needs
 
 import twodof
 from twodof import TwoDofError, sweep
-from twodof.sweeps.batches import MOST_DEATHS
+from twodof.sweeps.runner import MOST_DEATHS
 
 
 def doors(process: int) -> dict[str, str]:

@@ -1,8 +1,8 @@
 """The public names, and where each is."""
 
 from .bag.exports import export_bag as export_bag
-from .bag.judging import verdict as verdict
 from .bag.reader import read_bag as read_bag
+from .bag.reader import verdict as verdict
 from .bag.recorded_commands import read_commands as read_commands
 from .bag.recording import Recording as Recording
 from .bag.recovery import recover as recover
@@ -23,8 +23,8 @@ from .linear import LinearModel as LinearModel
 from .linear import linearise as linearise
 from .pages.arm import page as page
 from .pages.foxglove import Foxglove as Foxglove
-from .pages.inline import show as show
 from .pages.live_page import live as live
+from .pages.replay import show as show
 from .pages.replay import view as view
 from .plots.runs import plot as plot
 from .ros.publisher import Publisher as Publisher

@@ -1,19 +1,26 @@
-"""Read bags of any writer as arrays."""
+"""Read bags of any writer as arrays, and judge runs."""
 
 from __future__ import annotations
 
 import logging
+from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 
 from ..bounds import MAX_DRAWN, MAX_SAMPLES, MAX_SAMPLES_RATIO, MIB
-from ..errors import BagError, no_such, path_of
+from ..errors import BagError, InputError, no_such, path_of
 from ..files import is_being_written, shown
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET
+from ..simulation.experiments import Experiment
+from ..simulation.judge import BLOCK
+from ..simulation.sample import Sample
+from ..simulation.setup import robot_of
+from ..simulation.stepping import judge_of
+from ..simulation.verdict import Verdict, conclude
 from .contents import read_messages, stated_count, storage_files
 from .downsampling import Downsampler
 from .joint_states import Ends, JointStates, Targets
@@ -237,3 +244,31 @@ def whole_bag(path: Path) -> list[Path]:
             raise BagError(f"the bag '{path}' is still being written")
         raise BagError(f"the bag '{path}' is unfinished: its writer died; repair it with 'twodof recover {path}'")
     return files
+
+
+def verdict(run: Recording | str | Path | Iterable[Sample], experiment: Experiment | None = None) -> Verdict:
+    """Return the verdict of a run: reached or not, how, and why.
+
+    Args:
+        run: a bag, its folder, or all samples of a run.
+        experiment: the experiment of the samples.
+
+    Raises:
+        BagError, FmuError: the bag, or the robot in the experiment's FMU, cannot be read.
+        InputError: samples are given without an experiment, or there are no samples.
+    """
+    if isinstance(run, Recording | str | Path):
+        return (run if isinstance(run, Recording) else read_bag(run)).verdict
+    if experiment is None:
+        raise InputError("samples are judged with their `experiment`")
+    judge, inputs = judge_of(experiment, robot_of(experiment.fmu.urdf)), None
+    for k, sample in enumerate(run):
+        if inputs is not None and sample.inputs is not inputs:
+            judge.change({name: value for name, value in sample.inputs.items() if value != inputs[name]})
+        inputs = sample.inputs
+        judge.rows.write(array("d", (*sample.q, *sample.v, *sample.x, *sample.tau, *sample.quat)))
+        if k % BLOCK == 0:
+            judge.flush()
+    if inputs is None:
+        raise InputError("there are no samples to judge")
+    return conclude(judge)

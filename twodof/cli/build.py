@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 from ..errors import InputError
-from .completion import links
 from .help import Parser
 from .info import controlled
 from .options import (
@@ -15,6 +14,7 @@ from .options import (
     add_output,
     check_company,
     given_options,
+    links,
     not_empty,
     output_file,
     parse_locks,

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..version import install
-from .completion import links
 from .fmus import is_robot
 from .help import Parser
-from .options import CommandLineError, add_options, add_output, given_options, not_empty, parse_locks
+from .options import CommandLineError, add_options, add_output, given_options, links, not_empty, parse_locks
 from .printing import plain, print_json, print_next, print_table, quote, say
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from .completion import variables
 from .help import Parser
-from .options import add_options, parse_settings
+from .options import add_options, parse_settings, variables
 from .printing import print_json, print_table, say
 
 if TYPE_CHECKING:

@@ -1,10 +1,11 @@
-"""Options that several verbs share."""
+"""Options that several verbs share, and completion of their values in the shell."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import time
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterable
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..plant.numerals import number, whole_number
-from . import completion
 from .help import Parser
 
 if TYPE_CHECKING:
@@ -47,6 +47,48 @@ def output_file(text: str) -> str:
     return STANDARD_OUTPUT if text == "-" else not_empty(text)
 
 
+def _file(options: argparse.Namespace) -> Path | None:
+    """Return the FMU, URDF or first bag on an incomplete command line."""
+    names = (getattr(options, name, None) for name in ("fmu", "urdf", "robot", "bag", "bags", "robots"))
+    first = next((name for name in names if name), None)
+    return Path(first[0] if isinstance(first, list) else first) if first else None
+
+
+def variables(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Complete an FMU's inputs and parameters."""
+    path = _file(parsed_args)
+    if path is None or path.suffix != ".fmu":
+        return []
+    from ..fmu import load_fmu
+
+    fmu = load_fmu(path)
+    return [f"{group}=" for causality in ("input", "parameter") for group in fmu.groups(causality)]
+
+
+def links(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Complete the links of a URDF or of a bag's robot."""
+    return [str(link.get("name")) for link in _robot(parsed_args).iterfind("link")]
+
+
+def joints(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Complete the moving joints of a URDF or of a bag's robot."""
+    found = _robot(parsed_args).iterfind("joint")
+    return [str(joint.get("name")) for joint in found if joint.get("type") != "fixed"]
+
+
+def _robot(options: argparse.Namespace) -> ET.Element:
+    path = _file(options)
+    if path is None:
+        return ET.Element("robot")
+    if path.suffix in (".urdf", ".xacro"):
+        from ..export.urdf_source import read_text
+
+        return ET.fromstring(read_text(path, None))
+    from ..bag.provenance import read_provenance, robot_in
+
+    return ET.fromstring(str(read_provenance(*robot_in(path))["urdf"]))
+
+
 Keywords = dict[str, Any]
 Table = dict[str, Keywords]
 OF_A_RUN: Table = {
@@ -55,7 +97,7 @@ OF_A_RUN: Table = {
         dest="settings",
         metavar="NAME=VALUE",
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
-        completer=completion.variables,
+        completer=variables,
         action="append",
         default=[],
     ),
@@ -81,14 +123,12 @@ OF_A_PAGE: Table = {
 }
 OPTIONS: Table = {
     "--cost": dict(metavar="EXPRESSION", help="cost that ranks the runs, such as 'settling + 0.1*peak_effort'"),
-    "--frame": dict(
-        type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)", completer=completion.links
-    ),
+    "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)", completer=links),
     "--lock": dict(
         dest="locks",
         metavar="JOINT[=VALUE]",
         help="joint to fix, a name or shell pattern, and its position, rad or m (0)",
-        completer=completion.joints,
+        completer=joints,
         action="append",
         default=[],
     ),
@@ -124,7 +164,7 @@ def add_robot_options(parser: Parser) -> None:
     """Add the options for the robot of a third-party bag."""
     parser.add_argument("--urdf", type=not_empty, metavar="U", help="URDF of the robot, for a bag without one")
     text = "end effector of that robot"
-    parser.add_argument("--frame", type=not_empty, metavar="LINK", help=text, completer=completion.links)
+    parser.add_argument("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
 
 
 def given_options(options: argparse.Namespace, *names: str) -> Keywords:

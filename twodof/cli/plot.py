@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .completion import joints
 from .help import Parser
-from .options import CommandLineError, add_options, add_output, add_robot_options, output_file
+from .options import CommandLineError, add_options, add_output, add_robot_options, joints, output_file
 from .printing import print_table, written
 from .sweep import print_best
 

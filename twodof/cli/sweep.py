@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from ..bounds import MAX_RUNS
 from ..plant.numerals import number
-from .completion import variables
 from .fmus import fast_fmu
 from .help import Parser
 from .options import (
@@ -25,6 +24,7 @@ from .options import (
     dated,
     given_options,
     parse_settings,
+    variables,
 )
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop

@@ -1,9 +1,11 @@
-"""Replay of a bag in the browser, from a server or from a file; the page contains all samples."""
+"""Replay of a bag in the browser, from a server or from a file with all samples; pages inline in a notebook."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from html import escape
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -14,7 +16,7 @@ from ..errors import BuildError, FmuError, PageError
 from ..export.mesh_files import collect_meshes
 from ..export.urdf_source import read_text
 from ..files import data_file, refusing, write_file
-from ..fmu import load_fmu, resource_reader
+from ..fmu import Fmu, load_fmu, resource_reader
 from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
 from ..geometry.shapes import Shape, link_shapes
@@ -22,10 +24,12 @@ from ..plant.urdf import RobotError, read_urdf
 from ..plots.scripts import packed
 from ..plots.track import Track, read_tracks
 from ..signatures import ignore, never, with_keywords_of
-from .arm import RECORDED, Arm, arm_page, names_page
+from ..simulation.experiments import experiment
+from .arm import RECORDED, Arm, arm_page, names_page, page_of
 from .serving import HOST, PORT, Server
 
 if TYPE_CHECKING:
+    import pandas
     from typing_extensions import Unpack
 
 FILMS = (".mp4", ".webp", ".gif", ".png")
@@ -33,6 +37,7 @@ FILMS = (".mp4", ".webp", ".gif", ".png")
 MOST_SAMPLES = 100_000  # of a bag with more samples, at most a quarter of this number is shown
 NO_ROBOT = '<robot name="none"><link name="base"/></robot>'
 IDLE = 0.05  # s between two checks of ``stop``
+HEIGHT = 560  # pixels of a page in a notebook
 
 
 class RobotOptions(TypedDict, total=False):
@@ -206,3 +211,42 @@ def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotO
     with refusing(PageError, f"write '{path}'"):
         write_file(Path(path), page)
     return remarks
+
+
+class Inline:
+    """A page that a notebook shows in an iframe."""
+
+    def __init__(self, page: str, height: int) -> None:
+        self._page, self._height = page, height
+
+    def __repr__(self) -> str:
+        return f"<page of {len(self._page) / 1024:.0f} KB>"
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{self._height}px;border:0"
+        return f'<iframe srcdoc="{escape(self._page)}" style="{style}" allow="fullscreen"></iframe>'
+
+
+def show(shown: Fmu | Recording | pandas.DataFrame | str | Path, *, height: int = HEIGHT) -> Inline:
+    """Return the page of an FMU, a recording or a sweep for a notebook, which displays it as a cell's result.
+
+    Args:
+        shown: a native FMU, whose plant runs in the page; a recording, which is replayed; the table of a sweep, which
+            becomes an interactive map; or the path of one of them.
+        height: height of the iframe, pixels.
+
+    Raises:
+        FmuError, BagError, SweepError, PageError, PlotError, BuildError: as ``page``, ``view`` and ``plot`` raise.
+    """
+    folder = Path(shown) if isinstance(shown, (str, Path)) and Path(shown).is_dir() else None
+    if isinstance(shown, (Fmu, str, Path)) and folder is None:
+        page = page_of(experiment(shown, stop_time=inf))
+    elif isinstance(shown, Recording) or (folder and not any(folder.glob("*.parquet"))):
+        page, _ = replay(shown if isinstance(shown, Recording) else str(folder))
+    elif folder or "provenance" in getattr(shown, "attrs", {}):
+        from ..plots.sweeps import map_html  # needs the extra "sweep"
+
+        page = map_html(shown)
+    else:
+        raise PageError("`show` shows an FMU, a recording, the table of a sweep, or the path of one of them")
+    return Inline(page.decode(), height)

@@ -10,11 +10,11 @@ from ..simulation.experiments import NANOSECONDS, Experiment
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample
 from .commands import LONGEST_NAME, Command, CommandError, Commands, deserialise, warner
-from .dds import dds_qos, dds_topic
 from .messages import JOINT_STATE, POINT, POSE, STREAM
+from .network import dds_qos, dds_topic
 
 # isort: split
-from cyclonedds import builtin, core, domain, sub  # dds raises if it is missing
+from cyclonedds import builtin, core, domain, sub  # network raises if it is missing
 
 LOG = logging.getLogger(__name__)
 ORDERS = {"/pause": "std_msgs/msg/Bool", "/step": "std_msgs/msg/UInt32"}

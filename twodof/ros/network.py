@@ -1,9 +1,11 @@
-"""ROS 2 network settings from environment variables, and the DDS domain.
+"""ROS 2 network settings from environment variables, the DDS domain, and DDS types of serialised messages.
 
-The variables are those of rcl and rmw_cyclonedds of Jazzy.
+The variables are those of rcl and rmw_cyclonedds of Jazzy. Names, types and qualities of service are those of ROS 2
+(type hashes of REP 2011). Therefore ROS 2's tools treat the run like any node.
 """
 
 import ctypes
+import functools
 import logging
 import os
 import re
@@ -15,15 +17,18 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from ipaddress import ip_address
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
+
+from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from ..errors import PublishError
 from ..files import temporary_folder
-from . import dds  # noqa: F401 - says what to install where what follows is missing
+from ..version import needing
+from .messages import store_of
 
-# isort: split
-from cyclonedds import core, domain
+with needing(PublishError, "publish", "ros"):
+    from cyclonedds import core, domain, idl, qos, topic
 
 LOG = logging.getLogger(__name__)
 RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
@@ -262,3 +267,55 @@ def _aborts(number: int, configuration: str) -> bool:
     """Return whether Cyclone DDS aborts the process that opens this domain, as for addresses of another family."""
     command = [sys.executable, "-I", "-c", OPEN, str(number), configuration, *sys.path]
     return subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode < 0
+
+
+def _keep(self: Any, cdr: bytes) -> None:
+    self.cdr = cdr
+
+
+SERIALISED = {
+    "__init__": _keep,
+    "serialize": lambda self, **_options: self.cdr,
+    "deserialize": classmethod(lambda cls, cdr: cls(cdr)),
+    "deserialize_key": classmethod(lambda cls, _key: None),  # a sample without data: a writer has left
+}
+"""Methods of every DDS type; they pass messages that rosbags has serialised."""
+
+
+@functools.cache
+def dds_type(name: str) -> type:
+    """Return the DDS type of a ROS 2 message type, named as rosidl_generator_dds_idl names it."""
+    package, _, kind = name.split("/")
+    fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
+    struct: type = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
+    for name, method in SERIALISED.items():  # not a base class, which would be part of the type
+        setattr(struct, name, method)
+    return struct
+
+
+def _field_type(node: Nodetype, of: Any) -> Any:
+    if node is Nodetype.NAME:
+        return dds_type(of)
+    if node is Nodetype.SEQUENCE:
+        return idl.types.sequence[_field_type(*of[0])]
+    return {"string": str, "bool": bool}.get(of[0]) or getattr(idl.types, of[0])
+
+
+def dds_qos(offered: Qos, type_name: str) -> qos.Qos:
+    """Return the quality of service of a writer or reader.
+
+    A write never waits for a reader; a slow reader misses messages.
+    """
+    latched = offered.durability is QosDurability.TRANSIENT_LOCAL
+    return qos.Qos(
+        qos.Policy.Reliability.Reliable(max_blocking_time=0),
+        qos.Policy.Durability.TransientLocal if latched else qos.Policy.Durability.Volatile,
+        qos.Policy.History.KeepLast(offered.depth),
+        qos.Policy.DataRepresentation(use_cdrv0_representation=True),
+        qos.Policy.Userdata(f"typehash={store_of(type_name).hash_rihs01(type_name)};".encode()),
+    )
+
+
+def dds_topic(participant: domain.DomainParticipant, name: str, type_name: str) -> topic.Topic:
+    """Return a topic of ROS 2 in DDS."""
+    return topic.Topic(participant, f"rt{name}", dds_type(type_name))

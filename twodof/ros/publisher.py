@@ -16,13 +16,12 @@ from ..simulation.sample import Sample, Sink
 from ..simulation.stepping import at_rest
 from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
-from .dds import dds_qos, dds_topic
 from .listener import ORDERS, Listener
 from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name, has_sensors
-from .network import Network, OpenDomain, network_of_environment, open_domain
+from .network import Network, OpenDomain, dds_qos, dds_topic, network_of_environment, open_domain
 
 # isort: split
-from cyclonedds import core, domain, pub  # dds raises if it is missing
+from cyclonedds import core, domain, pub  # network raises if it is missing
 
 LOG = logging.getLogger(__name__)
 JOINT_COMMANDS, TARGET_COMMAND, CLICKED_POINT = "joint_commands", "target_command", "clicked_point"

@@ -14,8 +14,7 @@ from threading import Event, Lock, Thread
 
 from ..errors import SweepError, TwoDofError
 from ..version import __version__, needing
-from .batches import LOOK, Batches
-from .runner import Job, Point, Row, Runner
+from .runner import LOOK, Batches, Job, Point, Row, Runner
 
 with needing(SweepError, "use a cluster", "cluster"):
     from distributed import Client, Future, KilledWorker, Worker, WorkerPlugin, get_worker, wait

@@ -21,11 +21,10 @@ from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 from ..simulation.progress import counting
 from ..version import versions
-from .batches import Batches
 from .design import Design, make_design
 from .pool import Pool
 from .results import Results, read_sweep
-from .runner import Job, Row
+from .runner import Batches, Job, Row
 
 if TYPE_CHECKING:
     import pandas

@@ -10,8 +10,7 @@ from subprocess import DEVNULL
 from ..children import Child
 from ..errors import SweepError
 from ..files import temporary_folder
-from .batches import LOOK, Batches
-from .runner import Job, Point, Row, Runner
+from .runner import LOOK, Batches, Job, Point, Row, Runner
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 MOST_FAILURES = 5  # successive failures of starting workers
