@@ -41,8 +41,7 @@ static const double P[STAGES + 1][4] = {
     {0, 0, 0, 0},
     {0, 131558114200.0 / 32700410799, -68118460800.0 / 10900136933, 87487479700.0 / 32700410799},
     {0, -1754552775.0 / 470086768, 14199869525.0 / 1410260304, -10690763975.0 / 1880347072},
-    {0, 127303824393.0 / 49829197408, -318862633887.0 / 49829197408,
-     701980252875.0 / 199316789632},
+    {0, 127303824393.0 / 49829197408, -318862633887.0 / 49829197408, 701980252875.0 / 199316789632},
     {0, -282668133.0 / 205662961, 2019193451.0 / 616988883, -1453857185.0 / 822651844},
     {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
 };
@@ -50,8 +49,7 @@ static const double QUADRATIC[2][4] = {{1, -0.5, 0, 0}, {0, 0.5, 0, 0}};
 
 /* q̈ at a state in the regime of the step, the efforts that hold joints at rest, and the margin of the rank,
    which may be NULL. */
-static void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS],
-                     double *margin)
+static void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS], double *margin)
 {
     const Stops *stops = &step->stops;
     const double *v = y + N_JOINTS;

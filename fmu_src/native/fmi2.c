@@ -12,8 +12,7 @@ void hand_over(const Instance *instance, Status status, const char *category, co
         *end++ = *c;
     }
     *end = '\0';
-    ((fmi2CallbackLogger)instance->log)(instance->environment, instance->name, status, category,
-                                        escaped);
+    ((fmi2CallbackLogger)instance->log)(instance->environment, instance->name, status, category, escaped);
 }
 
 const char *fmi2GetTypesPlatform(void)
@@ -70,17 +69,14 @@ VARIABLES(Boolean, BOOLEAN)
 VARIABLES(Integer, INTEGER)
 VARIABLES(String, OTHER)
 
-fmi2Status fmi2GetDirectionalDerivative(fmi2Component component,
-                                        const fmi2ValueReference unknown[], size_t n_unknown,
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2ValueReference unknown[], size_t n_unknown,
                                         const fmi2ValueReference known[], size_t n_known,
                                         const fmi2Real seed[], fmi2Real result[])
 {
-    return directional_derivative(component, unknown, n_unknown, known, n_known, seed, n_known,
-                                  result, n_unknown);
+    return directional_derivative(component, unknown, n_unknown, known, n_known, seed, n_known, result, n_unknown);
 }
 
-fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
-                      fmi2Boolean no_set_state_prior)
+fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h, fmi2Boolean no_set_state_prior)
 {
     (void)no_set_state_prior;
     return do_step(component, point, h);

@@ -90,14 +90,12 @@ fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference vr[], s
 #if IS_CLOCKED
 #include "clock.c"
 #else
-fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
-                        fmi3Clock value[])
+fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count, fmi3Clock value[])
 {
     return get_values(instance, GET_OTHER, vr, count, value, count);
 }
 
-fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
-                        const fmi3Clock value[])
+fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count, const fmi3Clock value[])
 {
     return set_values(instance, SET_OTHER, vr, count, value, count);
 }
@@ -108,8 +106,7 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
                                         size_t n_known, const fmi3Float64 seed[], size_t n_seed,
                                         fmi3Float64 result[], size_t n_result)
 {
-    return directional_derivative(instance, unknown, n_unknown, known, n_known, seed, n_seed, result,
-                                  n_result);
+    return directional_derivative(instance, unknown, n_unknown, known, n_known, seed, n_seed, result, n_result);
 }
 
 fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 point, fmi3Float64 h,

@@ -95,8 +95,7 @@ static void orthogonalise(double J[N_ROWS][N_JOINTS], double b[N_ROWS])
 #ifdef IS_COMPLEX
 /* The rows are orthogonal, but their variations are not. To first order, rotate the dropped rows out of the kept ones,
    and correct b for the rest. */
-static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double square[N_ROWS],
-                 const int kept[N_ROWS])
+static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double square[N_ROWS], const int kept[N_ROWS])
 {
     double part[N_ROWS];
     for (int i = 0; i < N_ROWS; i++)
@@ -123,8 +122,7 @@ static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double squa
 
 /* σ/σ_max of orthogonal rows in descending order, all 0 where σ_max is rounding error; index has the rank order of the
    rows. */
-static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double ratio[N_ROWS],
-                      int index[N_ROWS])
+static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double ratio[N_ROWS], int index[N_ROWS])
 {
     double largest = 0.0;
     for (int k = 0; k < N_ROWS; k++) {

@@ -144,8 +144,7 @@ Status STANDARD(SerializedFMUstateSize)(void *component, void *saved, size_t *si
     return OK;
 }
 
-Status STANDARD(SerializeFMUstate)(void *component, void *saved, STANDARD(Byte) bytes[],
-                                   size_t size)
+Status STANDARD(SerializeFMUstate)(void *component, void *saved, STANDARD(Byte) bytes[], size_t size)
 {
     Instance *instance = enter(component, SERIALIZE, saved && bytes);
     if (!instance)
@@ -158,8 +157,7 @@ Status STANDARD(SerializeFMUstate)(void *component, void *saved, STANDARD(Byte) 
     return OK;
 }
 
-Status STANDARD(DeSerializeFMUstate)(void *component, const STANDARD(Byte) bytes[], size_t size,
-                                     void **saved)
+Status STANDARD(DeSerializeFMUstate)(void *component, const STANDARD(Byte) bytes[], size_t size, void **saved)
 {
     Instance *instance = enter(component, DESERIALIZE, bytes && saved);
     uint64_t sum;

@@ -77,12 +77,10 @@ static int settable(Instance *instance, Call call, int variable)
     if (is_state(variable) && instance->kind == MODEL_EXCHANGE)
         return allowed(instance, SET_Q_V, VARIABLE_NAME[variable]);
     if (variable >= FIRST_OUTPUT && variable < FIRST_PARAMETER) {
-        report(instance, ERROR, "%s: %s is computed and cannot be set", call_name(call),
-               VARIABLE_NAME[variable]);
+        report(instance, ERROR, "%s: %s is computed and cannot be set", call_name(call), VARIABLE_NAME[variable]);
         return 0;
     }
-    return allowed(instance, variable < FIRST_OUTPUT ? SET_INPUT : SET_PARAMETER,
-                   VARIABLE_NAME[variable]);
+    return allowed(instance, variable < FIRST_OUTPUT ? SET_INPUT : SET_PARAMETER, VARIABLE_NAME[variable]);
 }
 
 /* True for a parameter that is an input. */
@@ -150,8 +148,7 @@ static Status update(Instance *instance, int variable)
         state->has_x = 1;
     }
     if (!isfinite(state->plant.value[variable]))
-        return report(instance, DISCARD, "%s: %s is not finite", call_name(GET_REAL),
-                      VARIABLE_NAME[variable]);
+        return report(instance, DISCARD, "%s: %s is not finite", call_name(GET_REAL), VARIABLE_NAME[variable]);
     return OK;
 }
 
