@@ -10,7 +10,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 from string import Template
-from typing import Any
 
 from ..errors import InputError
 from ..files import data_file, head_of, refusing, write_file
@@ -77,13 +76,14 @@ def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
     template = Template(data_file("ros", "layout.rviz").read_text("utf-8"))
     layout = json.loads(template.substitute(prefix=prefix, frame=json.dumps(fmu.root), pitch=pitch, yaw=yaw))
 
-    def shows(display: Mapping[str, Any]) -> bool:
-        """Return whether a display has no topic, or a topic of the robot with the right type."""
-        kind = types.get(display.get("Topic", {}).get("Value"), "").rpartition("/")[2]
-        return "Topic" not in display or kind.startswith(display["Class"].rpartition("/")[2])
+    def shows(topic: str | None, display: str) -> bool:
+        """Return whether a kind of display has no topic, or a topic of the robot with the right type."""
+        kind = types.get(topic or "", "").rpartition("/")[2]
+        return topic is None or kind.startswith(display.rpartition("/")[2])
 
     manager = layout["Visualization Manager"]
-    manager["Displays"] = [display for display in manager["Displays"] if shows(display)]
+    shown = [one for one in manager["Displays"] if shows(one.get("Topic", {}).get("Value"), one["Class"])]
+    manager["Displays"] = shown
     return json.dumps(layout, indent=2) + "\n"
 
 

@@ -7,19 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from .assertions import REPORT
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from ..bag.recording import Recording
-    from ..fmu import Fmu
-    from ..fmu.checking import Check
-    from ..simulation.experiments import Experiment, ExperimentOptions
+    import twodof
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -35,13 +30,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture
-def run_fmu(tmp_path: Path) -> Callable[..., Recording]:
+def run_fmu(tmp_path: Path) -> Callable[..., twodof.Recording]:
     """Return a function that runs an FMU, writes a bag and returns its ``Recording``; keywords as in ``twodof.run``.
 
     The bag has efforts if the FMU has outputs tau[i].
     """
 
-    def run(fmu: Experiment | Fmu | str | Path, **options: Unpack[ExperimentOptions]) -> Recording:
+    def run(fmu: twodof.Experiment | twodof.Fmu | str | Path, **options: Any) -> twodof.Recording:
         import twodof
 
         bag = tmp_path / f"run{len(list(tmp_path.glob('run*')))}"
@@ -54,10 +49,10 @@ def run_fmu(tmp_path: Path) -> Callable[..., Recording]:
 
 
 @pytest.fixture
-def check_fmu() -> Callable[..., Check]:
+def check_fmu() -> Callable[..., twodof.Check]:
     """Return a function that checks an FMU by ``twodof.check``, and fails with the failed rows."""
 
-    def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
+    def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> twodof.Check:
         import twodof
 
         found = twodof.check(fmu, tools=tools)
