@@ -74,37 +74,20 @@ def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
 
 def _ends(path: Path, summaries: Sequence[McapSummary]) -> Recording | None:
     """Return the ends of a robot's joint states by the summaries; None if these do not decide on the topic."""
-    folder, prefix, others = _place(path)
-    counts: Counter[tuple[str, str]] = Counter()
-    total = 0
+    robot, budget, counts = _Robot(path, Ends, None), ReadBudget(), Counter[tuple[str, str]]()
     for summary in summaries:
         for number, count in summary.counts.items():
-            channel = summary.channels[number]
-            if _is_within(channel.topic, prefix, others):
-                counts[channel.topic, channel.type] += count
-            total += count
-    stating = [topic for topic, kind in counts if kind == JOINT_STATE]
-    usual = prefix + JOINT_STATES
-    if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
+            counts[summary.channels[number][:2]] += count
+    stating = [topic for topic, kind in counts if kind == JOINT_STATE and robot.has(topic)]
+    if len(stating) > 1 and robot.usual not in stating:  # the topic that comes first in the file decides
         return None
-    chosen = usual if usual in stating else "".join(stating)
-    ends, budget = Ends(path), ReadBudget()
+    chosen = robot.usual if robot.usual in stating else "".join(stating)
     for summary in summaries:
         for batch in summary.ends(chosen, budget):
-            ends.add(batch.stamps, batch.messages)
-    _check_count(folder, total)
-    return _recording(path, counts, chosen, ends, None, Inputs(read_provenance(*robot_in(path))))
-
-
-def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
-    """Return a bag's folder, the chosen robot's topic prefix, and the prefixes of robots nested in its namespace."""
-    folder, namespace = robot_in(path)
-    inside = (name for name in robots_of(folder) if name.startswith(f"{namespace}/"))
-    return folder, f"/{namespace}" if namespace else "", tuple(f"/{name}/" for name in inside)
-
-
-def _is_within(topic: str, prefix: str, others: tuple[str, ...]) -> bool:
-    return not prefix or (topic.startswith(f"{prefix}/") and not topic.startswith(others))
+            robot.add(*batch)
+    robot.counts = Counter({topic: count for topic, count in counts.items() if robot.has(topic[0])})
+    _check_count(robot.folder, counts.total())
+    return robot.recording()
 
 
 @contextmanager
@@ -129,23 +112,29 @@ class _Robot:
         self, path: Path, kind: type[JointStates], targets: Targets | None, downsampler: Downsampler | None = None
     ) -> None:
         self.path, self.downsampler = path, downsampler
-        self.folder, self._prefix, self._others = _place(path)
+        self.folder, self._namespace = robot_in(path)
+        self._prefix = f"/{self._namespace}" if self._namespace else ""
+        self._nested = tuple(f"/{name}/" for name in robots_of(self.folder) if name.startswith(f"{self._namespace}/"))
+        self.usual = self._prefix + JOINT_STATES
         self._kind, self._targets = kind, targets
-        self._counts: Counter[tuple[str, str]] = Counter()
+        self.counts: Counter[tuple[str, str]] = Counter()
         self._chosen, self.states, self._thinned = "", kind(path), False
 
     @cached_property
     def _inputs(self) -> Inputs:
-        return Inputs(read_provenance(*robot_in(self.path)))
+        return Inputs(read_provenance(self.folder, self._namespace))
+
+    def has(self, topic: str) -> bool:
+        """Return whether a topic is the robot's, and not one of a robot nested in its namespace."""
+        return not self._prefix or (topic.startswith(f"{self._prefix}/") and not topic.startswith(self._nested))
 
     def add(self, channel: Channel, stamps: Stamps, messages: Rows) -> None:
         """Add messages of any topic of the bag."""
-        if not _is_within(channel.topic, self._prefix, self._others):
+        if not self.has(channel.topic):
             return
-        self._counts[channel.topic, channel.type] += len(stamps)
+        self.counts[channel.topic, channel.type] += len(stamps)
         if channel.type == JOINT_STATE:
-            usual = channel.topic == self._prefix + JOINT_STATES
-            if channel.topic != self._chosen and (not self._chosen or usual):
+            if channel.topic != self._chosen and (not self._chosen or channel.topic == self.usual):
                 self._chosen, self.states = channel.topic, self._kind(self.path)
             if channel.topic == self._chosen:
                 self.states.add(stamps, messages)
@@ -161,12 +150,29 @@ class _Robot:
         self.states.keep(downsampler.choose(self._made()))
 
     def _made(self) -> Recording:
-        return _recording(self.path, self._counts, self._chosen, self.states, self._targets, self._inputs)
+        count = self.counts[self._chosen, JOINT_STATE]
+        if not count:
+            where = f" of the robot that its {file_of(self._namespace)} is of" if self._namespace else ""
+            raise BagError(f"'{self.path}' has no joint states{where}, no messages of type {JOINT_STATE}")
+        stamps, q, v, tau = self.states.arrays()
+        return Recording(
+            path=self.path,
+            count=count,
+            topics=tuple(TopicCount(*topic, number) for topic, number in sorted(self.counts.items())),
+            stamps=stamps,
+            joints=self.states.names,
+            q=q,
+            v=v,
+            tau=tau,
+            received=self._targets.received(stamps) if self._targets is not None else None,
+            provenance=self._inputs.provenance,
+            inputs=self._inputs,
+        )
 
     def recording(self) -> Recording:
         """Return the recording at the end of the bag."""
-        stating = [topic for topic, kind in self._counts if kind == JOINT_STATE]
-        if len(stating) > 1 and self._chosen != self._prefix + JOINT_STATES:
+        stating = [topic for topic, kind in self.counts if kind == JOINT_STATE]
+        if len(stating) > 1 and self._chosen != self.usual:
             topics = ", ".join(map(shown, stating))
             LOG.warning(f"'{self.path}' has several topics of joint states, {topics}; {shown(self._chosen)} is read")
         if self.downsampler is not None and self._thinned:
@@ -203,34 +209,6 @@ def _check_count(path: Path, count: int) -> None:
             f"'{path}' has {stated} messages according to its metadata.yaml, and {count} in its"
             f" files; 'twodof recover {path}' corrects this"
         )
-
-
-def _recording(
-    path: Path,
-    counts: Counter[tuple[str, str]],
-    chosen: str,
-    states: JointStates,
-    targets: Targets | None,
-    inputs: Inputs,
-) -> Recording:
-    if not counts[chosen, JOINT_STATE]:
-        _, robot = robot_in(path)
-        where = f" of the robot that its {file_of(robot)} is of" if robot else ""
-        raise BagError(f"'{path}' has no joint states{where}, no messages of type {JOINT_STATE}")
-    stamps, q, v, tau = states.arrays()
-    return Recording(
-        path=path,
-        count=counts[chosen, JOINT_STATE],
-        topics=tuple(TopicCount(*topic, count) for topic, count in sorted(counts.items())),
-        stamps=stamps,
-        joints=states.names,
-        q=q,
-        v=v,
-        tau=tau,
-        received=targets.received(stamps) if targets is not None else None,
-        provenance=inputs.provenance,
-        inputs=inputs,
-    )
 
 
 def whole_bag(path: Path) -> list[Path]:

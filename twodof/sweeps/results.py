@@ -184,23 +184,18 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
     wanted = parsed(json.dumps(wanted).encode())
     for key in COMPARED:
         if there[key] != wanted[key]:
-            other = {
-                "fmu": f"another FMU, {there['fmu']['file']} ({there['fmu']['guid']})",
-                "bags": f"`bags={there['bags']}`",
-            }
-            raise SweepError(
-                f"'{path}' was begun with {other.get(key) or _differing(there[key], wanted[key])};"
-                " begin this sweep in another `output`, or resume that one as it was begun"
-            )
+            if key == "fmu":
+                other = f"another FMU, {there['fmu']['file']} ({there['fmu']['guid']})"
+            elif key == "bags":
+                other = f"`bags={there['bags']}`"
+            else:
+                differing = {name: value for name, value in there[key].items() if value != wanted[key].get(name)}
+                texts = (f"{name.replace('_', ' ')} {json.dumps(value):.200}" for name, value in differing.items())
+                other = ", ".join(texts)
+            remedy = "begin this sweep in another `output`, or resume that one as it was begun"
+            raise SweepError(f"'{path}' was begun with {other}; {remedy}")
     if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
         raise SweepError(f"'{path}' was begun by twodof {there['versions']['twodof']}; continue with that version")
-
-
-def _differing(there: dict[str, object], wanted: dict[str, object]) -> str:
-    """Return the stored settings that differ from the wanted ones, as text."""
-    return ", ".join(
-        f"{key.replace('_', ' ')} {json.dumps(value):.200}" for key, value in there.items() if value != wanted.get(key)
-    )
 
 
 def _write(path: Path, table: pa.Table) -> None:
