@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
@@ -142,7 +142,7 @@ def _solve(
     low: Array,
     scales: Array,
     steps: int,
-) -> Any:
+) -> OptimizeResult:
     """Return SciPy's least-squares result for the whitened rows and the weak prior."""
 
     def errors(z: Array) -> Array:
