@@ -66,15 +66,18 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
                          double rate[N_JOINTS], double z[N_JOINTS])
 {
     double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0};
-    int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0, count = 1, finite = isfinite(acting) != 0, bounded = 0;
+    JointPosition joint[N_BODIES];
+    EndBody end_body[N_LOADED];
+    int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0, count = 1, finite = isfinite(acting) != 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        const int resists = contact[i].there && contact[i].high > 0.0 && contact[i].low < 0.0;
-        const int rests = (contact[i].there && contact[i].fixed) || resists || is_pressed(&contact[i], rate[i]);
-        contact[i].at = rests || !contact[i].there ? 0 : contact[i].side > 0.0 ? -1 : 1;
-        free[i] = rests ? 0.0 : 1.0;
-        any |= rests;
-        bounded |= contact[i].there;
+        contact[i].at = 0; /* most joints rest */
+        free[i] = contact[i].there ? 0.0 : 1.0;
+        any |= contact[i].there;
         finite &= isfinite(rate[i]) != 0;
+    }
+    if (any) {
+        place_joints(q, joint);
+        body(plant->value, 0, end_body);
     }
     for (int pivot = 0; any && finite && count > 0 && pivot < MOST_PIVOTS; pivot++) {
         int wrong[N_JOINTS], next[N_JOINTS];
@@ -82,7 +85,7 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
         count = 0;
         for (int i = 0; i < N_JOINTS; i++)
             given[i] = free[i] == 0.0 ? -rate[i] : bound(&contact[i]);
-        hybrid_motion(plant, q, &plant->value[ARMATURE], free, given, change, z);
+        hybrid_dynamics(joint, end_body, &plant->value[ARMATURE], free, given, change, z);
         for (int i = 0; i < N_JOINTS; i++)
             largest = fmax(largest, fabs(free[i] == 0.0 ? z[i] : given[i]));
         for (int i = 0; i < N_JOINTS; i++) {
@@ -100,6 +103,6 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
     }
     for (int i = 0; i < N_JOINTS; i++)
         rate[i] = free[i] == 0.0 ? 0.0 : rate[i] + change[i];
-    return !bounded || (finite && (!any || count == 0));
+    return !any || (finite && count == 0);
 }
 #endif
