@@ -3,6 +3,7 @@
     python benchmarks/robots.py                      all, about 20 minutes
     python benchmarks/robots.py panda ur5            those whose path has one of these words
     python benchmarks/robots.py --versions [WORD …]  ten robots in FMI 3.0 and 2.0, about 10 minutes
+    python benchmarks/robots.py --falls [WORD …]     bare robots that fall onto their stops, about 10 minutes
 
 It prints a table in Markdown, and returns exit status 1 if a result is wrong.
 
@@ -16,6 +17,11 @@ Versions: each robot under each control starts at 0.3 rad/s or m/s in each joint
 steps of 10 ms for 1 s in FMPy's `simulate_fmu`. All values of q, v, x and tau are compared bit for bit; a difference is
 wrong. Ratios are of 3.0 to 2.0: bytes of the library, and processor time of a step including reading its outputs, the
 least of interleaved runs.
+
+Falls: native FMUs without a controller start at rest and fall for 0.3 s in steps of 10 ms, with the URDF's joint
+friction and without friction. "worst step" is the step with the longest processor time, of which the least of ROUNDS
+runs counts. "error" is the largest difference of a joint in the first 0.1 s from a run at rtol 1e-8, atol 1e-11 and
+max_step 0.1 ms, rad or m.
 """
 
 from __future__ import annotations
@@ -64,6 +70,15 @@ COMPARED = (
     "tiago_description/robots/tiago_no_hand.urdf",
     "baxter_description/urdf/baxter.urdf",
 )
+FALLING = (
+    "tiago_description/robots/tiago_dual.urdf",
+    "tiago_description/robots/tiago.urdf",
+    "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+    "centauro_description/urdf/centauro.urdf",
+    "talos_data/robots/talos_full_v2.urdf",
+    "allegro_hand_description/urdf/allegro_left_hand.urdf",
+)
+FALL_STEPS, EXACT = 30, {"rtol": 1e-8, "atol": 1e-11, "max_step": 1e-4}
 FLIGHT = 0.1  # s
 GROUPS = ("q", "v", "x", "tau")
 STEP, STEPS, ROUNDS = 0.01, 100, 60
@@ -196,6 +211,50 @@ def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
     return [*row, f"{best[1] / best[0]:.3f}"], equal
 
 
+# --- Bare robots that fall onto their stops ---
+
+
+def fall(instance: Instance, fmu: twodof.Fmu, settings: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the processor time of each step, s, and q after it."""
+    instance.reset()
+    values = {n: x for group, x in settings.items() for n in fmu.vector(group) or [group]}
+    instance.initialise(0.0, np.inf, values)
+    read, times, rows = instance.reader(fmu.vector("q")), [], []
+    for k in range(FALL_STEPS):
+        start = time.process_time()
+        instance.step(k * STEP, STEP)
+        times.append(time.process_time() - start)
+        rows.append(read())
+    return np.array(times), np.array(rows)
+
+
+def fallen(urdf: Path, folder: Path) -> list[list[str]]:
+    """Return rows of the table: friction, worst step, error."""
+    frame = frame_of(urdf.read_text("utf-8"))
+    options = twodof.FmuOptions(urdf=urdf, frame=frame, control="effort", native=True, meshes=False)
+    fmu = twodof.load_fmu(twodof.build_fmu(folder / "bare.fmu", options, overwrite=True))
+    rows = []
+    for friction in (None, 0.0):
+        settings = {} if friction is None else {"friction": friction}
+        with instantiate(fmu) as instance:
+            runs = [fall(instance, fmu, settings) for _ in range(ROUNDS)]
+            _, exact = fall(instance, fmu, settings | EXACT)
+        worst = 1e3 * np.min([times for times, _ in runs], axis=0).max()
+        off = np.abs(exact - runs[0][1])[: round(FLIGHT / STEP)].max()
+        words = "none" if friction is not None else "as in the URDF"
+        rows.append([str(len(fmu.joints)), words, f"{worst:.1f} ms", f"{off:.0e}"])
+    return rows
+
+
+def fallen_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
+    """Yield rows of the table, each with True."""
+    yield ["URDF", "joints", "friction", "worst step", "error"], True
+    for name in FALLING:
+        if not words or any(word in name for word in words):
+            for row in fallen(ROBOTS / name, folder):
+                yield [Path(name).name, *row], True
+
+
 def built_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
     """Yield rows of the table, each with True if it is right."""
     yield ["URDF", "joints", "frame", "error", "Python, µs a step", "native"], True
@@ -223,8 +282,8 @@ def compared_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], b
 def main() -> int:
     """Print the table; return 1 if a result is wrong."""
     logging.disable(logging.WARNING)
-    words = [word for word in sys.argv[1:] if word != "--versions"]
-    rows = compared_rows if words != sys.argv[1:] else built_rows
+    words = [word for word in sys.argv[1:] if word[:2] != "--"]
+    rows = compared_rows if "--versions" in sys.argv else fallen_rows if "--falls" in sys.argv else built_rows
     wrong = 0
     with tempfile.TemporaryDirectory() as folder:
         for k, (row, right) in enumerate(rows(words, Path(folder))):

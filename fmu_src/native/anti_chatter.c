@@ -4,7 +4,7 @@
 #include <string.h>
 
 static const double CHATTER_TIME = 0.5, SHORT_CHATTER_TIME = 1.0 / 4096.0, FIRST_HOLD = 1.0 / 16777216.0,
-                    HOLD_GROWTH = 8.0, HOLD_OF_ALL = 1.0 / 512.0;
+                    FIRST_RIGID_HOLD = 1.0 / 32.0, HOLD_GROWTH = 8.0, HOLD_OF_ALL = 1.0 / 512.0;
 
 /* End and length, s, of a hold: of joints at limits, of a joint in friction, or of the rank of J⁺. */
 typedef struct {
@@ -28,7 +28,7 @@ static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
     memset(chatter, 0, sizeof *chatter);
     chatter->rigid = plant->value[RIGID_STOPS] != 0.0;
     chatter->chatter_time = CHATTER_TIME * plant->value[MAX_STEP];
-    chatter->first = chatter->rigid ? fmax(SHORT_CHATTER_TIME * coarseness(plant), FIRST_HOLD) : FIRST_HOLD;
+    chatter->first = chatter->rigid ? fmax(FIRST_RIGID_HOLD * coarseness(plant), FIRST_HOLD) : FIRST_HOLD;
     chatter->risen = -HUGE_VAL;
     chatter->joints = chatter->rank = none;
     for (int i = 0; i < N_JOINTS; i++) {
@@ -60,8 +60,8 @@ static int is_at_limit(const Step *step, int i)
     return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
 }
 
-/* Hold the joints that chatter at t, and set `kept` for all joints that are held. A hold of HOLD_OF_ALL or longer
-   covers all joints at limits. Return the time at which the first hold ends, at most h. */
+/* Hold the joints that chatter at t, and set `kept` for all joints that are held. A repeated hold of HOLD_OF_ALL
+   or longer covers all joints at limits. Return the time at which the first hold ends, at most h. */
 static double hold_joints(AntiChatter *chatter, const Step *step, double t, double h, int kept[N_JOINTS])
 {
     double end = chatter->rank.until > t ? fmin(h, chatter->rank.until) : h;
@@ -70,7 +70,8 @@ static double hold_joints(AntiChatter *chatter, const Step *step, double t, doub
         any |= chatter->chattering[i];
     if (any)
         hold_for_a_while(&chatter->joints, t, chatter->soon, chatter->longest, chatter->first);
-    const int all = any && chatter->joints.length >= HOLD_OF_ALL * chatter->chatter_time;
+    const double length = chatter->joints.length;
+    const int all = any && length >= HOLD_OF_ALL * chatter->chatter_time && length > chatter->first * chatter->longest;
     for (int i = 0; i < N_JOINTS && (any || !(chatter->joints.until > t)); i++)
         chatter->joints_held[i] = all ? is_at_limit(step, i) : chatter->chattering[i];
     if (chatter->joints.until > t)

@@ -10,7 +10,7 @@ enum { LOOKS = 4 };
 static const double DOUBT = 0.25;
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
-static const double RELEASE_RESOLUTION = 1.0 / 67108864.0; /* 2⁻²⁶ */
+static const double RELEASE_RESOLUTION = 1.0 / 8192.0, FINEST_RELEASE = 1.0 / 67108864.0; /* 2⁻¹³, 2⁻²⁶ */
 static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
 
 /* The event at the end of a step: joints that reached a limit, and joints that slipped and came to rest. */
@@ -98,7 +98,8 @@ static double singular_margin(Step *step, double passed, int rank_held)
 static double locate(Step *step, Margin *margin, int joint, double a, double at_a, double b,
                      double at_b)
 {
-    const double resolution = (margin == release_margin ? RELEASE_RESOLUTION : TIME_RESOLUTION) * step->size;
+    const double released = fmax(RELEASE_RESOLUTION * coarseness(step->plant), FINEST_RELEASE);
+    const double resolution = (margin == release_margin ? released : TIME_RESOLUTION) * step->size;
     const double k = 0.2 / (b - a);
     double slack = b - a; /* how much longer the interval may be than after bisection */
     while (b - a > resolution) {
@@ -141,16 +142,24 @@ static double search(Step *step, Margin *margin, int joint, double rate, double 
     return first;
 }
 
-/* First time at which the margin of a component is negative, or HUGE_VAL. */
-static double first_crossing(Step *step, Margin *margin, int component)
+/* First time at which the margin of a component is negative, or HUGE_VAL. If the margin is at first 0, it may dip below
+   0 by less than `dip` before it is positive. */
+static double first_crossing(Step *step, Margin *margin, int component, double dip)
 {
     const double *c = step->Q[component];
     const double slope[4] = {c[0], 2.0 * c[1], 3.0 * c[2], 4.0 * c[3]};
     double turn[4], before = 0.0, at_before = margin(step, 0.0, component);
     const int turns = sign_changes(slope, 3, turn);
-    for (int k = 0; k <= turns; k++) {
-        const double after = k < turns ? turn[k] * step->size : step->size;
-        const double at_after = margin(step, after, component);
+    int k = 0;
+    for (int i = 0; i < turns; i++)
+        turn[i] *= step->size;
+    turn[turns] = step->size;
+    if (dip > 0.0 && turns > 0 && at_before == 0.0) {
+        const double least = margin(step, turn[0], component);
+        k = least < 0.0 && least > -dip && margin(step, turn[1], component) >= 0.0;
+    }
+    for (; k <= turns; k++) {
+        const double after = turn[k], at_after = margin(step, after, component);
         if (at_after < 0.0)
             return locate(step, margin, component, before, at_before, after, at_after);
         before = after;
@@ -216,7 +225,10 @@ static double first_release(Step *step, double before)
         doubt |= step->stops.watched[i] && may_be_released(step, i);
     if (!doubt)
         return HUGE_VAL;
-    const double instant = TIME_RESOLUTION * step->size, at_start = least_grip(step, step->effort[0]);
+    const double instant = TIME_RESOLUTION * step->size;
+    if (before <= instant)
+        return HUGE_VAL;
+    const double at_start = least_grip(step, step->effort[0]);
     const double at_once = at_start > 4.0 * step->rounding ? at_start : release_margin(step, instant, 0);
     if (at_once < 0.0 && at_once < -fabs(release_margin(step, 0.0, 0) - at_start))
         return instant; /* beyond the difference of two ways to compute the efforts; else the joint would be held again */
@@ -307,7 +319,9 @@ static double first_event(Step *step, int rank_held, Event *event)
     interpolate(step);
     double first = HUGE_VAL, crossing[N_STATES];
     for (int i = 0; i < N_STATES; i++) {
-        crossing[i] = near[i] ? first_crossing(step, i < N_JOINTS ? limit_margin : slip_margin, i) : HUGE_VAL;
+        const int leaves = i < N_JOINTS && step->y[N_JOINTS + i] == 0.0; /* its limit, if it is there */
+        crossing[i] = !near[i] ? HUGE_VAL : first_crossing(step, i < N_JOINTS ? limit_margin : slip_margin, i,
+                                                           leaves ? value[ATOL] : 0.0);
         first = fmin(first, crossing[i]);
     }
     first = fmin(first, first_release(step, first));

@@ -28,9 +28,9 @@ static const double FINEST_TOLERANCE = 1.0 / 68719476736.0; /* 2⁻³⁶ */
 /* Step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s. */
 static const double NUDGE = 1e-6;
 /* Fraction of the largest step. Joints that an impact moves, and that come to rest within it, stop with the impact. */
-static const double WINDOW = 1.0 / 8192.0; /* 2⁻¹³ */
+static const double WINDOW = 1.0 / 64.0;
 /* Largest short step, by which an event soon is reached, as a fraction of the largest step. */
-static const double SHORT = 1.0 / 16.0;
+static const double SHORT = 0.25;
 
 /* Determine the regime at y, where joints may rest. */
 static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
@@ -124,26 +124,29 @@ static double expected_stop(const Step *step, double most)
     return first <= most ? first : HUGE_VAL;
 }
 
-/* Try to reach the next event by a short step of one evaluation; return the time of the event in it, 0 without one. */
-static double short_step(Step *step, double left, int rank_held, Event *event)
+/* Try a short step of one evaluation to the next event, or to the end if a hold of joints ends there; return its length,
+   with the event, or 0. */
+static double short_step(Step *step, double left, int hold_ends, int rank_held, Event *event)
 {
-    const double most = SHORT * step->plant->value[MAX_STEP];
-    step->size = fmin(2.0 * expected_stop(step, 0.5 * most), left);
-    if (!(0.0 < step->size && step->size <= most) || !(heun(step) / share_of_tolerance(step) < 1.0))
+    const double most = SHORT * step->plant->value[MAX_STEP], expected = expected_stop(step, 0.5 * most);
+    step->size = fmin(2.0 * expected, left);
+    if (!(step->size > 0.0 && step->size <= most && (hold_ends || expected < HUGE_VAL))
+        || !(heun(step) / share_of_tolerance(step) < 1.0))
         return 0.0;
-    return first_event(step, rank_held, event);
+    const double passed = first_event(step, rank_held, event);
+    return passed == 0.0 && hold_ends && step->size == left ? left : passed;
 }
 
 /* Integrate from the time t and the state y until an event, the end, or the end of the budget; return the time, with y
    the state there, or NaN on failure. */
-static double until_event(Step *step, double t, double end, int rank_held, int *integrator, Event *event,
-                          Failure *failure)
+static double until_event(Step *step, double t, double end, int hold_ends, int rank_held, int *integrator,
+                          Event *event, Failure *failure)
 {
     const double max_step = step->plant->value[MAX_STEP];
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
     if (all_rest(step))
         return end;
-    const double soon = *integrator == STIFF ? 0.0 : short_step(step, end - t, rank_held, event);
+    const double soon = *integrator == STIFF ? 0.0 : short_step(step, end - t, hold_ends, rank_held, event);
     if (soon > 0.0) {
         memcpy(step->y, step->y_new, sizeof step->y);
         return soon == end - t ? end : t + soon;
@@ -213,7 +216,7 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
         step.crossed |= t > 0.0 && step.stops.rank != before;
         if (changes_back(&chatter, &step, before, t))
             continue;
-        t = until_event(&step, t, end, rank_held, &integrator, &event, failure);
+        t = until_event(&step, t, end, end < h && !rank_held, rank_held, &integrator, &event, failure);
         find_chatter(&chatter, &step, &event, t);
         for (int i = 0; stopped_at && i < N_JOINTS; i++)
             if (event.stopped[i])

@@ -104,8 +104,8 @@ static int stop_within(const Plant *plant, double window, double y[N_STATES], co
                        const int slip[N_JOINTS], const int kept[N_JOINTS])
 {
     Contact contact[N_JOINTS];
-    double rate[N_JOINTS], free[N_JOINTS], given[N_JOINTS], change[N_JOINTS], impulse[N_JOINTS], *v = y + N_JOINTS;
-    int any = 0;
+    double rate[N_JOINTS], impulse[N_JOINTS], *v = y + N_JOINTS;
+    int rests[N_JOINTS], any = 0, stops = 0;
     if (window == 0.0)
         return 0;
     find_contacts(plant, y, kept, contact);
@@ -123,13 +123,18 @@ static int stop_within(const Plant *plant, double window, double y[N_STATES], co
     if (!any || !complementary(plant, y, contact, window * acting_effort(plant, y, v, a), rate, impulse))
         return 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        free[i] = contact[i].there && rate[i] == 0.0 ? 0.0 : 1.0;
-        given[i] = free[i] == 0.0 ? -v[i] : 0.0;
+        rests[i] = contact[i].there && rate[i] == 0.0;
+        stops |= rests[i] && v[i] != 0.0;
     }
-    hybrid_motion(plant, y, &plant->value[ARMATURE], free, given, change, impulse);
-    for (int i = 0; i < N_JOINTS; i++)
-        v[i] = free[i] == 0.0 ? 0.0 : v[i] + change[i];
-    impact(plant, y, kept);
+    if (!stops)
+        return 0;
+    find_contacts(plant, y, kept, contact); /* of impacts that follow, in which these joints rest */
+    for (int i = 0; i < N_JOINTS; i++) {
+        contact[i].there |= rests[i];
+        contact[i].fixed |= rests[i];
+    }
+    if (!complementary(plant, y, contact, 0.0, v, impulse))
+        v[0] = NAN; /* which no step accepts */
     return 1;
 }
 

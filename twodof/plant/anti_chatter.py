@@ -6,14 +6,15 @@ from math import inf, sqrt
 
 Tolerance = Callable[[float], float]
 """Tolerance of the error test on a position, by its value."""
-CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-12, 2.0**-24, 8.0, 2.0**-9
-"""Times of the anti-chatter rule. CHATTER_TIME is a fraction of the largest step, SHORT_CHATTER_TIME and HOLD_OF_ALL
-are fractions of CHATTER_TIME, and FIRST_HOLD is a fraction of the longest hold. A joint that returns to its limit too
-soon is held there for FIRST_HOLD, at a rigid stop for SHORT_CHATTER_TIME. Each repetition lengthens the hold by the
-factor HOLD_GROWTH. With rigid stops, a return within CHATTER_TIME is too soon, and a hold of HOLD_OF_ALL or longer
-covers all joints at limits. Without holds, an acceleration that grazes zero, or joints that push each other off their
-limits, would release and stop joints without end. The rank of J⁺ is held in the same way if it drops soon after a rise:
-the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded.
+CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH = 0.5, 2.0**-12, 2.0**-24, 8.0
+FIRST_RIGID_HOLD, HOLD_OF_ALL = 2.0**-5, 2.0**-9
+"""Times of the anti-chatter rule. CHATTER_TIME is a fraction of the largest step, SHORT_CHATTER_TIME, FIRST_RIGID_HOLD
+and HOLD_OF_ALL are fractions of CHATTER_TIME, and FIRST_HOLD is a fraction of the longest hold. A joint that returns to
+its limit too soon is held there for FIRST_HOLD, at a rigid stop for FIRST_RIGID_HOLD. Each repetition lengthens the
+hold by the factor HOLD_GROWTH. With rigid stops, a return within CHATTER_TIME is too soon, and a repeated hold of
+HOLD_OF_ALL or longer covers all joints at limits. Without holds, an acceleration that grazes zero, or joints that push
+each other off their limits, would release and stop joints without end. The rank of J⁺ is held in the same way if it
+drops soon after a rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded.
 
 The error of a hold bounds it for the rank (``Slide``) and for stops without reaction (``clamp_time``). In a hold of
 length τ, joint i errs by Δa_i τ²/2, where Δa is the difference of the accelerations with and without the hold. This

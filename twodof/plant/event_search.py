@@ -30,14 +30,15 @@ their range.
 """
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
-TIME_RESOLUTION, RELEASE_RESOLUTION = 2.0**-52, 2.0**-26
-"""Resolution of the time of an event, as a fraction of the step. At a release the acceleration is 0, so that the error
-of the state grows with the square of that of the time.
+TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE = 2.0**-52, 2.0**-13, 2.0**-26
+"""Resolutions of the time of an event, as fractions of the step: of all events but a release, and the largest and the
+smallest of a release. There the acceleration is 0, so that the error of the state grows with the cube of that of the
+time.
 """
-TOGETHER, WINDOW, USUAL_RTOL = 2.0**-25, 2.0**-13, 1e-3
+TOGETHER, WINDOW, USUAL_RTOL = 2.0**-25, 2.0**-6, 1e-3
 """Fractions of the largest step. Joints that reach rigid stops within the first of an event stop with it. Joints
 that an impact moves, and that come to rest within the second, stop with the impact. Below USUAL_RTOL, the second
-shrinks with rtol, as the first hold at a rigid stop does.
+shrinks with rtol, as the first hold at a rigid stop and the resolution of a release do.
 """
 THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
 
@@ -135,14 +136,18 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, resolut
     return b
 
 
-def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float:
+def first_crossing(margin: Margin, slope: Sequence[float], step: float, dip: float) -> float:
     """Return the first time at which a position is past a limit or a velocity past 0, or infinity.
 
-    ``slope`` has the coefficients of the margin's rate as a polynomial of time over the step, ascending.
+    ``slope`` has the coefficients of the margin's rate as a polynomial of time over the step, ascending. A margin that
+    is 0 at first may fall below 0 by less than ``dip`` before it is positive: where a joint leaves its limit, an error
+    of the interpolant would otherwise be a crossing.
     """
     before, at_before = 0.0, margin(0.0)
-    for turn in (*sign_changes(slope), 1.0):
-        after = turn * step
+    turns = [turn * step for turn in (*sign_changes(slope), 1.0)]
+    if dip and len(turns) > 1 and at_before == 0.0 and -dip < margin(turns[0]) < 0.0 <= margin(turns[1]):
+        del turns[0]
+    for after in turns:
         at_after = margin(after)
         if at_after < 0.0:
             return locate(margin, before, at_before, after, at_after, TIME_RESOLUTION * step)
@@ -194,6 +199,7 @@ def first_release(
     doubtful: Sequence[int],
     step: float,
     before: float,
+    coarseness: float,
 ) -> float:
     """Return the first time before ``before`` at which a joint is released, or infinity.
 
@@ -203,12 +209,15 @@ def first_release(
         doubtful: indices of the distances that may reach 0.
         step: size of the step, s.
         before: a time within the step, s.
+        coarseness: factor of the resolution.
     """
 
     def margin(passed: float) -> float:
         return min(grips(passed))
 
-    instant = TIME_RESOLUTION * step
+    instant, resolution = TIME_RESOLUTION * step, max(RELEASE_RESOLUTION * coarseness, FINEST_RELEASE) * step
+    if before <= instant:
+        return inf
     if (at_once := margin(instant)) < 0.0 and at_once < -abs(margin(0.0) - min(at_ends[0])):
         return instant  # beyond the difference of two ways to compute the efforts; else the joint would be held again
     inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
@@ -224,7 +233,7 @@ def first_release(
             if at_look < 0.0:
                 b, at_b = look, at_look
         if at_b < 0.0:
-            return locate(margin, a, at_a, b, at_b, RELEASE_RESOLUTION * step)
+            return locate(margin, a, at_a, b, at_b, resolution)
     return inf
 
 

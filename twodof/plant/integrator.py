@@ -8,7 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 
-from .anti_chatter import CHATTER_TIME, FIRST_HOLD, HOLD_OF_ALL, SHORT_CHATTER_TIME, Hold, Slide, clamp_time
+from .anti_chatter import (
+    CHATTER_TIME,
+    FIRST_HOLD,
+    FIRST_RIGID_HOLD,
+    HOLD_OF_ALL,
+    SHORT_CHATTER_TIME,
+    Hold,
+    Slide,
+    clamp_time,
+)
 from .dormand_prince import State
 from .equations import Equations
 from .regime import AUTOMATIC, Motion
@@ -65,7 +74,7 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
     n, stops, t = motion.n, motion.stops, 0.0
     chatter_time = CHATTER_TIME * motion.max_step
     short_time = SHORT_CHATTER_TIME * chatter_time
-    first = max(SHORT_CHATTER_TIME * motion.coarseness, FIRST_HOLD) if stops.rigid else FIRST_HOLD
+    first = max(FIRST_RIGID_HOLD * motion.coarseness, FIRST_HOLD) if stops.rigid else FIRST_HOLD
     joint_hold, slide, stuck = Hold(), Slide(), [Hold() for _ in range(n)]
     left, slipped = [-inf] * n, [-inf] * n  # last release and start of slip
     soon, longest = chatter_time, chatter_time  # times of the holds at limits
@@ -75,7 +84,7 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
         if any(chattering):
             joint_hold.again(t, soon, longest, first)
             anti_chatter = chattering
-            if joint_hold.length >= HOLD_OF_ALL * chatter_time:
+            if joint_hold.length >= HOLD_OF_ALL * chatter_time and joint_hold.length > first * longest:
                 anti_chatter = stops.at_limits(y)
         elif joint_hold.until <= t:
             anti_chatter = [False] * n
@@ -95,7 +104,7 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
             slide.rise(t, y[n:])
         elif motion.rank < rank and slide.drop(t, y, rates, motion.tolerance, chatter_time):
             continue
-        t, y, event = motion.until_event(y, rates, t, min(end, h))
+        t, y, event = motion.until_event(y, rates, t, min(end, h), hold_ends=end < h and not rank_held)
         for i in event.stopped:
             passed, tolerance = t - left[i], inf if stops.rigid else motion.tolerance(y[i])
             hold = clamp_time(passed, y[n + i], tolerance, chatter_time)

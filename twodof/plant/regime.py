@@ -6,7 +6,8 @@ begins in another regime. A step is accepted only if its error test passes. The 
 ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I", II.4).
 
 Where a joint is expected to stop soon, a short step of one evaluation tries to reach that event. Without an event in
-it, it is discarded. Impacts on many joints with friction are followed by such events within microseconds.
+it, it is discarded, unless it ends with a hold of joints. Impacts on many joints with friction are followed by such
+events within microseconds.
 
 After a change of the rank, steps share the tolerances: motion back and forth across a singularity takes so many steps
 that their errors would add up to energy.
@@ -27,7 +28,7 @@ from .rosenbrock import CUBIC, damping_limits, rosenbrock
 from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
-SHORT = 1.0 / 16.0
+SHORT = 0.25
 """Longest short step, as a fraction of the largest step."""
 AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
 """Values of the parameter ``integrator``."""
@@ -139,14 +140,16 @@ class Motion:
         """Return the tolerance of the error test on a position."""
         return self.atol + self.rtol * abs(q)
 
-    def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
+    def until_event(
+        self, y: State, rates: State, t: float, end: float, *, hold_ends: bool
+    ) -> tuple[float, State, events.Event]:
         """Integrate from t, with ẏ at y, until an event, the end, or the end of the budget.
 
-        Return the time, the state and the event.
+        Return the time, the state and the event. ``hold_ends`` means that a hold of joints ends at the end.
         """
         if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
             return end, y, events.Event()  # inputs and all joints are held: nothing changes
-        soon = None if self._stiff else self._short_step(y, rates, end - t)
+        soon = None if self._stiff else self._short_step(y, rates, end - t, hold_ends)
         if soon is not None:
             passed, y, event = soon
             return end if passed == end - t else t + passed, y, event
@@ -203,16 +206,21 @@ class Motion:
         """Return the fraction of the tolerances that a step may use."""
         return shared_tolerance(step / self.max_step, self.rtol) if self.crossed else 1.0
 
-    def _short_step(self, y: State, rates: State, left: float) -> tuple[float, State, events.Event] | None:
-        """Return the result of ``_first_event`` in a short step to an event that is expected soon."""
+    def _short_step(
+        self, y: State, rates: State, left: float, hold_ends: bool
+    ) -> tuple[float, State, events.Event] | None:
+        """Return the result of a short step to an event that is expected soon, or to the end of a hold of joints."""
         most = SHORT * self.max_step
         expected = events.expected_stop(y, rates, self.stops, 0.5 * most)
         step = min(2.0 * expected, left)
-        if not 0.0 < step <= most:
+        if not (0.0 < step <= most and (hold_ends or expected < inf)):
             return None
         del self.grips[1:], self.margins[1:]
         y_new, K, norm = heun(self.rates, y, step, rates, self.rtol, self.atol)
-        return self._first_event(y, y_new, step, K, HEUN) if norm / self._share(step) < 1.0 else None
+        if not norm / self._share(step) < 1.0:
+            return None
+        found = self._first_event(y, y_new, step, K, HEUN)
+        return (left, y_new, events.Event()) if found is None and hold_ends and step == left else found
 
     def _too_fast(self, y: State, *, too_fine: bool) -> StepError:
         joint, rate = fastest_joint(lambda at: self.acceleration(at)[0], y)
@@ -239,7 +247,8 @@ class Motion:
         crossings = {}
         for i in near:
             slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(weights).tolist())]
-            crossings[i] = events.first_crossing(self._margin_of(i, state), slope, step)
+            dip = self.atol if i < n and y[n + i] == 0.0 else 0.0
+            crossings[i] = events.first_crossing(self._margin_of(i, state), slope, step, dip)
         first = min(crossings.values(), default=inf)
 
         def grips(passed: float) -> list[float]:
@@ -250,7 +259,7 @@ class Motion:
 
         if doubtful:
             at_ends = self.grips[0], self.grips[-1]
-            first = min(first, events.first_release(grips, at_ends, doubtful, step, first))
+            first = min(first, events.first_release(grips, at_ends, doubtful, step, first, self.coarseness))
         if near_rank:
             a, b = singular_margin(0.0), singular_margin(step)
             pace = events.PACE / events.REACH * sweep / step

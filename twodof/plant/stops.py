@@ -86,14 +86,22 @@ class Stops:
         if not into:
             return False
         if self.rigid:
-            W = self._inverse_mass(y[:n])
-            bounds = {i: (0.0, inf) if side > 0.0 else (-inf, 0.0) for i, side in sides.items()}
-            impulse, _ = _complementary(W, y[n:], bounds, fixed, 0.0)
-            y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
-            into = [i for i in sides if impulse[i]]
-        for i in into:
-            y[n + i] = 0.0
+            self._collide(y, self._inverse_mass(y[:n]), sides, fixed)
+        else:
+            for i in into:
+                y[n + i] = 0.0
         return True
+
+    def _collide(self, y: list[float], W: Array, sides: Mapping[int, float], fixed: Collection[int]) -> None:
+        """Apply the impulses of rigid stops to the state (q, v); ``fixed`` joints rest whatever their impulse is."""
+        n = len(self.limits)
+        bounds = {i: (-inf, inf) for i in fixed}
+        bounds |= {i: (0.0, inf) if side > 0.0 else (-inf, 0.0) for i, side in sides.items()}
+        impulse, at = _complementary(W, y[n:], bounds, fixed, 0.0)
+        y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
+        for i in at:
+            if at[i] == 0:
+                y[n + i] = 0.0
 
     def stop_within(self, window: float, y: list[float], a: Sequence[float], kept: Sequence[bool]) -> bool:
         """Stop joints whose motion friction or a rigid stop ends within a window; return whether there are any.
@@ -116,10 +124,10 @@ class Stops:
         fixed = [i for i in bounds if (kept[i] or self._has_no_range(i)) and (i in sides or v[i] == 0.0)]
         _, at = _complementary(W, rates, bounds, fixed, window * self._largest_effort(y, a))
         resting = [i for i, state in at.items() if state == 0]
-        v += W[:, resting] @ np.linalg.solve(W[np.ix_(resting, resting)], -v[resting])
-        v[resting] = 0.0
-        y[n:] = v.tolist()
-        self.impact(y, kept)
+        if not v[resting].any():
+            return False
+        locked = {i for i in sides if kept[i] or self._has_no_range(i)}
+        self._collide(y, W, sides, locked | {*resting})
         return True
 
     def slide(self, v: Sequence[float]) -> list[int]:
