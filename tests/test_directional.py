@@ -182,11 +182,11 @@ def test_derivatives_are_those_of_central_differences(case, complex_numbers):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_jacobian_is_that_of_complex_steps(case):
+def test_the_jacobian_is_that_of_complex_steps(case, length):
     name, control, settings = CASES[case]
     engine, rng = Derivatives(model(name, control)), np.random.default_rng(8)
     first = 0 if control == "effort" else engine.model.index("tau_ext")
-    for _ in range(25):
+    for _ in range(length(500, 25)):
         values = at_random(engine, rng, **{"f_ext": rng.normal(0, 5, 3).tolist()} | settings)
         ours, steps = engine.slopes(values)[:, first:], engine.jacobian(values)[-engine.n :, first:]
         assert np.abs(ours - steps).max() <= 1e-12 * np.abs(steps).max()
