@@ -11,23 +11,26 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from statistics import median
+from time import thread_time
+from unittest.mock import patch
 
 import numpy as np
 from arms import STEP, STEPS, compiled, shipped_arm
 from report import Figure, machine, print_figures, print_rows, spent
 
 import twodof
-from twodof.simulation.judge import BLOCK, OUTPUTS
-from twodof.simulation.stepping import judge_of
+from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.sweeps.runner import Job, Runner
 
-TURNS, SAMPLES, RUNS, SWEPT, BLOCKS = 5, 50_000, 20, 400, 15
+TURNS, SAMPLES, RUNS, SWEPT, BLOCKS, LONG = 5, 50_000, 20, 400, 15, 1_000_000
 MESSAGES = 10_000_000
 TWODOF = [sys.executable, "-m", "twodof"]
 
@@ -101,24 +104,33 @@ def steps_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float], folder: Pa
     yield Figure("the same with scene=True / without", f"{ratio:.2f}", "<= 2")
 
 
-def verdict_around(fmu: twodof.Fmu) -> Iterator[Figure]:
-    """Compare the verdict of a block of samples with the run of the block; the least of many turns each."""
-    run = twodof.experiment(fmu, stop_time=(1 + BLOCKS) * BLOCK * STEP, step=STEP)
-    judge, steps = judge_of(run, None), twodof.samples(run)
-    row = memoryview(bytes(8 * sum(len(fmu.vector(group)) for group in OUTPUTS)))
+def verdict_around(fmu: twodof.Fmu, folder: Path) -> Iterator[Figure]:
+    """Compare the verdict of a long run with the run and its bag, and its memory with that of a tenth of it."""
+    row = bytes(8 * sum(len(fmu.vector(group)) for group in OUTPUTS))
+    flush, flushes = Judge.flush, []
 
-    def judged() -> None:
+    def timed(judge: Judge) -> None:
+        begin = thread_time()
+        flush(judge)
+        flushes.append(thread_time() - begin)
+
+    def written() -> None:
+        write = BytesIO().write
         for _ in range(BLOCK):
-            judge.rows.write(row)
-        judge.flush()
+            write(row)
 
-    def stepped() -> None:
-        for _ in range(BLOCK):
-            next(steps)
+    def ran(steps: int) -> tuple[float, float]:
+        bag = twodof.Bag(folder / "long", overwrite=True)
+        seconds = spent(lambda: twodof.simulate(fmu, bag, stop_time=steps * STEP, step=STEP))[0]
+        return seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
-    verdict, alone = (min(times) for times in zip(*((spent(judged)[0], spent(stepped)[0]) for _ in range(BLOCKS))))
-    what = f"the verdict of {BLOCK} samples / twodof.samples without a verdict"
-    yield Figure(what, f"{100 * verdict / alone:.1f} %", "<= 2 %")
+    _, memory = ran(LONG // 10)
+    with patch.object(Judge, "flush", timed):
+        seconds, peak = ran(LONG)
+    rows = LONG / BLOCK * min(spent(written)[0] for _ in range(BLOCKS))
+    what = f"the verdict of a run of {LONG:.0e} samples / the run with its bag".replace("e+0", "e")
+    yield Figure(what, f"{100 * (rows + sum(flushes)) / seconds:.1f} %", "<= 2 %")
+    yield Figure("peak memory of this run more than that of a tenth of it", f"{peak - memory:.0f} MB", "<= 10 MB")
 
 
 def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterator[Figure]:
@@ -207,7 +219,7 @@ def main(messages: int = MESSAGES) -> list[Figure]:
         in_c = floor(folder)
         figures = [
             *steps_around(fmu, in_c, folder),
-            *verdict_around(fmu),
+            *verdict_around(fmu, folder),
             *sweep_around(fmu, in_c),
             *workers_around(fmu),
         ]
