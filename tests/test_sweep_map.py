@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,19 @@ def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_pho
     with browser.chromium() as chromium:
         for scheme in ("light", "dark"):
             with chromium.new_context(color_scheme=scheme, offline=True) as context:
+                context.set_default_timeout(1e3 * browser.TIMEOUT)
                 shown = context.new_page()
                 shown.set_viewport_size({"width": 390, "height": 844})
                 shown.goto(page.as_uri())
                 seen.append(shown.locator("body > svg[viewBox]").screenshot())
                 ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+                shown.wait_for_selector("#maps[data-ready]", state="attached")
+                behind = shown.evaluate("getComputedStyle(document.querySelector('#maps .bg')).fill")
                 assert max(shown.evaluate(LINES)) == 1
                 assert shown.evaluate("document.documentElement.scrollWidth") == 390
     assert ground == "rgb(20, 20, 20)"
+    level = np.mean([int(part) for part in re.findall(r"\d+", behind)[:3]])
+    assert 100 < level < 180, behind  # Viridis is from violet, which black hides, to yellow
     light, dark = (np.asarray(Image.open(io.BytesIO(picture))) for picture in seen)
     inner = (slice(2, -2), slice(2, -2))  # without the edge, which is mixed with the ground
     apart = np.abs(light[inner].astype(int) - dark[inner])

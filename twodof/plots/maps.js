@@ -80,6 +80,7 @@ class SweepPage {
       if (kind === "map") {
         const color = columns[shown[2]];
         const symbol = color.map((value) => (value === null ? "square-open" : "square"));
+        if (dark.matches) base.plot_bgcolor = "#8a9299"; // on which both ends of the colours are seen
         Object.assign(dots.marker, { color, symbol, colorscale: "Viridis", showscale: true, colorbar: { thickness: 10, outlinewidth: 0 } });
         dots.hovertemplate = `%{text}<br>${shown[0]} %{x}<br>${shown[1]} %{y}<br>%{marker.color:.4g}<extra></extra>`;
       } else {
