@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,8 +29,12 @@ def pd_fmu(
     factor: float = 1.0,
     initial: str | None = None,
     replaced: Mapping[str, str] = MappingProxyType({}),
+    effort: str = "",
 ) -> bytes:
-    """Return the FMU of native/pd.c, with q in a given unit of angle, stated dependencies, and replaced texts."""
+    """Return the FMU of native/pd.c, with q in a given unit of angle, stated dependencies, and replaced texts.
+
+    ``effort`` is another expression of C for its outputs.
+    """
     rows = [
         *(
             (f"{name}[{i + 1}]", 2 * k + i, "input", f'Real start="0.0" unit="{unit if k != 1 else "rad/s"}"')
@@ -71,7 +76,10 @@ def pd_fmu(
     for old, new in replaced.items():
         assert old in xml
         xml = xml.replace(old, new)
-    sources = {**standard_headers(), "pd.c": (HERE / "native/pd.c").read_bytes()}
+    code = (HERE / "native/pd.c").read_text("utf-8")
+    if effort:
+        code = re.sub(r"(?<=c->value\[TAU \+ i\] = )[^;]+", effort, code, count=1)
+    sources = {**standard_headers(), "pd.c": code.encode()}
     library = compile_library(sources, "linux64", "pd", units=["pd.c"], flags=["-fvisibility=default"])
     return zipped({"modelDescription.xml": xml.encode(), "binaries/linux64/pd.so": library})
 

@@ -240,7 +240,7 @@ class Steering(twodof.Sink):
 
 
 @pytest.mark.parametrize(
-    "options", [{"steer": lambda: None}, {"stop_time": 51.0}, {"stop": iter([False] * 20 + [True] * 9).__next__}]
+    "options", [{"steer": lambda: None}, {"stop_time": 51.0}, {"stop": iter([False] * 3 + [True] * 9).__next__}]
 )
 def test_a_run_that_cannot_be_repeated_has_no_trial(fmus: dict[str, Path], options) -> None:
     causes = twodof.simulate(fmus["task"], settings={"payload": 0.3}, **options).verdict.causes

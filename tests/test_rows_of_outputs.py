@@ -1,16 +1,19 @@
-"""Runs whose sinks receive rows of outputs instead of samples, compared with runs of samples."""
+"""Runs whose sinks receive rows of outputs, from spans in C or in Python, compared with runs of samples."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rosbags.highlevel import AnyReader
+from systems import WIRES, component, connection, loop, pd_fmu, ssd
 
 import twodof
 from twodof.errors import SimulationError
+from twodof.fmu import spans
 
 STEPS = 320
 
@@ -45,6 +48,28 @@ def recorded(run: twodof.Experiment, bag: twodof.Bag, *further: twodof.Sink) -> 
     return messages(bag.path), summary.last, str(summary.verdict), twodof.read_bag(bag.path).provenance["verdict"]
 
 
+def in_each_way(
+    monkeypatch: pytest.MonkeyPatch, work: Callable[[str, tuple[twodof.Sink, ...]], object], *, in_c: bool | None = True
+) -> list[Any]:
+    """Return results of work that is done with spans in C, with spans in Python, and with samples."""
+    found, made, span_of = [], list[int](), spans.span_of
+
+    def watched(instance: twodof.fmu.Instance) -> Any:
+        span = span_of(instance)
+
+        def call(*arguments: Any) -> Any:
+            made.append(1)
+            return span(*arguments)
+
+        return call if span else None
+
+    monkeypatch.setattr(spans, "span_of", watched)
+    found.append(work("c", ()))
+    assert in_c is None or bool(made) == in_c
+    monkeypatch.setattr(spans, "span_of", lambda _: None)
+    return [*found, work("python", ()), work("samples", (Watcher(),))]
+
+
 @pytest.mark.parametrize(
     "control, storage, options",
     [
@@ -53,13 +78,16 @@ def recorded(run: twodof.Experiment, bag: twodof.Bag, *further: twodof.Sink) -> 
         ("joint", "sqlite3", {}),
         ("effort", "mcap", {"scene": True}),
         ("split", "mcap", {"effort": True}),
+        ("split 3", "mcap", {"effort": True}),
         ("task", "mcap", {"measured": True}),
     ],
 )
 def test_a_bag_of_rows_has_the_messages_of_samples(
-    control: str, storage: str, options: dict[str, Any], tmp_path: Path
+    control: str, storage: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    part: dict[str, Any] = {"part": "split"} if control == "split" else {"native": True, "control": control}
+    part: dict[str, Any] = {"native": True, "control": control}
+    if control.startswith("split"):
+        part = {"part": "split", "fmi": 3 if control == "split 3" else 2}
     path = twodof.build_fmu(tmp_path / "arm", twodof.FmuOptions(name="Arm", **part))
     given = {"q_noise": 1e-3, "control_period": 0.01} if options.get("measured") else {"v_start": (0.1, -0.2)}
     times: dict[str, Any] = {
@@ -69,11 +97,69 @@ def test_a_bag_of_rows_has_the_messages_of_samples(
         "stamp_start": 1e9 / 3.0,
     }
     run = twodof.experiment(path, settings=given, **times)
-    found = [
-        recorded(run, twodof.Bag(tmp_path / f"bag{k}", storage=storage, **options), *further)
-        for k, further in enumerate([(), (Watcher(),)])
-    ]
-    assert found[0] == found[1]
+
+    def work(way: str, further: tuple[twodof.Sink, ...]) -> object:
+        return recorded(run, twodof.Bag(tmp_path / way, storage=storage, **options), *further)
+
+    first, *others = in_each_way(monkeypatch, work, in_c=None if "measured" in options else True)
+    assert others == [first, first]
+
+
+@pytest.mark.parametrize("feedthrough", ["direct", "transformed"])
+def test_a_loop_with_a_third_party_controller_is_equal_in_each_way(
+    feedthrough: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = twodof.build_fmu(tmp_path / "plant.fmu", twodof.FmuOptions(native=True, control="effort")).read_bytes()
+    wires = WIRES
+    if feedthrough == "transformed":  # a call alone does not do this
+        inside = '<ssc:LinearTransformation factor="2.0"/>'
+        wires = WIRES.replace(connection("pd.tau[1]", "plant.tau_cmd[1]"), "") + connection(
+            "pd.tau[1]", "plant.tau_cmd[1]", inside
+        )
+    system = f"<ssd:Elements>{component('plant')}{component('pd')}</ssd:Elements><ssd:Connections>{wires}"
+    path = loop(tmp_path / "loop.ssp", plant, pd_fmu(), ssd(f"{system}</ssd:Connections>"))
+    run = twodof.experiment(path, step=1 / 320, stop_time=STEPS / 320, stamp_start=0, settings={"pd.Kp": 0.1})
+
+    def work(way: str, further: tuple[twodof.Sink, ...]) -> object:
+        return recorded(run, twodof.Bag(tmp_path / way), *further)
+
+    first, *others = in_each_way(monkeypatch, work, in_c=feedthrough == "direct")
+    assert others == [first, first]
+
+
+def outcome(run: twodof.Experiment, bag: Path, *further: twodof.Sink) -> tuple[str, str]:
+    """Return the error of a run that fails, and the digest of the messages so far."""
+    with pytest.raises(SimulationError) as caught:
+        twodof.simulate(run, twodof.Bag(bag), *further)
+    return str(caught.value), messages(bag)
+
+
+@pytest.mark.parametrize("failing, count", [("plant", 71), ("pd", 70)])
+def test_a_refused_call_has_the_same_message_and_samples_in_each_way(
+    failing: str, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = twodof.build_fmu(tmp_path / "plant.fmu", twodof.FmuOptions(native=True, control="effort"))
+    effort = "c->steps < 70 ? 0.0 : 1e300" if failing == "plant" else "0.0; if (c->steps >= 70) return fmi2Error"
+    path = loop(tmp_path / "loop.ssp", path.read_bytes(), pd_fmu(effort=effort))
+    run = twodof.experiment(path, step=1 / 320, stop_time=1.0, stamp_start=0)
+    results = in_each_way(monkeypatch, lambda way, further: outcome(run, tmp_path / way, *further))
+    assert results[1:] == results[:1] * 2
+    assert f"'{failing}': " in results[0][0]
+    assert twodof.read_bag(tmp_path / "c").count == count
+
+
+def test_a_number_that_is_not_finite_ends_a_run_in_each_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {f'name="{old}[{i}]"': f'name="{new}[{i}]"' for old, new in (("q", "a"), ("v", "b")) for i in (1, 2)}
+    names |= {'name="tau[1]"': 'name="q[1]"', 'name="tau[2]"': 'name="v[1]"', 'unit="N.m"': ""}
+    pd = pd_fmu(replaced=names, effort="c->steps < 70 ? 0.1 * c->steps : 0.0 / 0.0")
+    plant = twodof.build_fmu(tmp_path / "plant.fmu", twodof.FmuOptions(native=True, control="effort")).read_bytes()
+    wires = connection("plant.q[1]", "pd.a[1]")
+    system = f"<ssd:Elements>{component('plant')}{component('pd')}</ssd:Elements><ssd:Connections>{wires}"
+    path = loop(tmp_path / "loop.ssp", plant, pd, ssd(f"{system}</ssd:Connections>"))
+    run = twodof.experiment(twodof.load_fmu(path, robot="pd"), step=1 / 320, stop_time=2.0, stamp_start=0)
+    results = in_each_way(monkeypatch, lambda way, further: outcome(run, tmp_path / way, *further))
+    assert results[1:] == results[:1] * 2
+    assert twodof.read_bag(tmp_path / "c").count == 70
 
 
 def test_a_bag_with_a_write_of_its_own_receives_samples(native_path: Path, tmp_path: Path) -> None:
@@ -83,7 +169,7 @@ def test_a_bag_with_a_write_of_its_own_receives_samples(native_path: Path, tmp_p
 
 
 def test_a_run_that_is_interrupted_leaves_every_sample_so_far(native_path: Path, tmp_path: Path) -> None:
-    calls = iter(range(100))
+    calls, bag = iter(range(3)), twodof.Bag(tmp_path / "bag")
 
     def interrupt() -> bool:
         if next(calls, None) is None:
@@ -91,14 +177,27 @@ def test_a_run_that_is_interrupted_leaves_every_sample_so_far(native_path: Path,
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop=interrupt)
-    assert twodof.read_bag(tmp_path / "bag").count == 101
+        twodof.simulate(native_path, bag, stop=interrupt, stop_time=50.0)
+    assert 2 < twodof.read_bag(bag.path).count == bag.count < 5001
+
+
+def test_spans_are_short_so_that_a_signal_ends_a_run_soon(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step that takes longer than FAST is a span of its own."""
+    monkeypatch.setattr("twodof.simulation.stepping.FAST", 0.0)
+    looks = iter(range(1000))
+    twodof.simulate(native_path, stop_time=1.0, stop=lambda: next(looks) < 0)
+    assert next(looks) >= 99
+    monkeypatch.setattr("twodof.simulation.stepping.FAST", 1e9)
+    looks = iter(range(1000))
+    twodof.simulate(native_path, stop_time=10.0, stop=lambda: next(looks) < 0)
+    assert next(looks) < 99
 
 
 @pytest.mark.parametrize("further", [(), (Watcher(),)], ids=["rows", "samples"])
 def test_a_step_that_fails_is_named_with_its_time(
     further: tuple[twodof.Sink, ...], native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(spans, "span_of", lambda _: None)
     step = twodof.fmu.Instance.step
 
     def fail(instance: twodof.fmu.Instance, t: float, h: float) -> None:

@@ -18,6 +18,7 @@
 #include "variables.c"
 #include "derivatives.c"
 #include "saved_state.c"
+#include "spans.c"
 #if FMI == 3
 #include "fmi3.c"
 #else

@@ -9,6 +9,9 @@ from copy import copy
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import BagError, path_of
 from ..files import sync
 from ..fmu import resource_reader
@@ -16,13 +19,11 @@ from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, Messages, check_name
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Value
-from ..simulation.sample import Sample, Sink
+from ..simulation.sample import Sample, Sink, TakeRows
 from ..simulation.verdict import Verdict
 from .provenance import ProvenanceFile
 from .storage import BATCH_SIZE, OVERHEAD, Stamps
 from .store import Store
-
-CHECKED = 64  # rows from one check of the storing thread to the next
 
 
 class Bag(Sink):
@@ -118,7 +119,7 @@ class Bag(Sink):
         if self._run is None:
             raise BagError("the bag is not open; open it by 'with bag.begin(experiment):'")
         self._queue: deque[bytes] = deque()  # packed numbers of waiting samples
-        self._rows: deque[bytes] = deque()  # outputs of waiting samples after these
+        self._rows: deque[NDArray[np.float64]] = deque()  # outputs of waiting samples after these
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
         self._verdict: dict[str, object] | None = None
         self._taken = 0  # samples that the thread has taken
@@ -140,20 +141,18 @@ class Bag(Sink):
         """True if outputs are enough, and no derived class has a ``write`` of its own."""
         return not self._measured and type(self).write is Bag.write
 
-    def take_rows(self, first: Sample) -> Callable[[bytes], object]:
-        """Write the first sample; return a function that writes each further one by its outputs, with equal inputs."""
+    def take_rows(self, first: Sample) -> TakeRows:
+        """Write the first sample; return a function that writes further ones by their outputs, with equal inputs."""
         self.write(first)
-        self._first, add, store = first, self._rows.append, self._store
+        self._first = first
+        return self._write_rows
 
-        def write_row(row: bytes) -> None:
-            add(row)
-            self.count += 1
-            if not self.count % CHECKED:
-                store.check()
-                if self.count - self._taken > self._most:
-                    store.flush()
-
-        return write_row
+    def _write_rows(self, rows: NDArray[np.float64]) -> None:
+        self._store.check()
+        self._rows.append(rows)
+        self.count += len(rows)
+        if self.count - self._taken > self._most:
+            self._store.flush()
 
     def conclude(self, verdict: Callable[[], Verdict]) -> None:
         """Receive the verdict, to be stored with the provenance."""
@@ -189,7 +188,7 @@ class Bag(Sink):
         if samples or rows:
             numbers = b"".join(samples)
             if rows:
-                numbers += self._messages.numbers_of(b"".join(rows), self._first, self._taken + len(samples))
+                numbers += self._messages.numbers_of(np.concatenate(rows), self._first, self._taken + len(samples))
             stamps, messages = self._messages.of_all(numbers)
             if not self._taken:
                 self._give(stamps[:1], self._messages.latched(stamps[0]))

@@ -200,6 +200,6 @@ def _zipped(
 def _add(archive: zipfile.ZipFile, files: Mapping[str, bytes]) -> None:
     for name in sorted(files):
         entry = zipfile.ZipInfo(name, ZIP_DATE)
-        entry.compress_type = zipfile.ZIP_DEFLATED
+        entry.compress_type = zipfile.ZIP_STORED if name.endswith(".fmu") else zipfile.ZIP_DEFLATED
         entry.external_attr = 0o644 << 16
         archive.writestr(entry, files[name])

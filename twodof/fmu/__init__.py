@@ -8,16 +8,19 @@ with redirect_stdout(None):  # FMPy prints on aarch64-linux that it has no logge
 from ..export.start_values import Setting, no_variable, resolve, resolve_all
 from .description import Fmu, load_any_fmu, opened, resource_reader
 from .instance import Instance, Values
+from .spans import SPAN, advancing
 from .system import System, load_fmu
 from .system_instance import SystemInstance, instantiate
 
 __all__ = [
+    "SPAN",
     "Fmu",
     "Instance",
     "Setting",
     "System",
     "SystemInstance",
     "Values",
+    "advancing",
     "instantiate",
     "load_any_fmu",
     "load_fmu",

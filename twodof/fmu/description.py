@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ class Fmu:
         identifier = self.description.coSimulation.modelIdentifier
         return f"{identifier}{fmpy.sharedLibraryExtension}"
 
-    @property
+    @cached_property
     def urdf(self) -> str | None:
         """Text of resources/robot.urdf; None without it."""
         content = resource_reader(self)("robot.urdf")

@@ -3,67 +3,33 @@
 from __future__ import annotations
 
 import logging
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from copy import deepcopy
-from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
-from itertools import accumulate, chain, count
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from ctypes import Array, addressof, byref, c_bool, c_char, c_double, c_int, c_size_t, c_uint, c_void_p, cast
+from itertools import accumulate, chain
 from math import inf
 from pathlib import Path
-from threading import Lock
-from typing import Any, NoReturn
+from typing import Any
 from weakref import WeakValueDictionary
 
 import fmpy
 import numpy as np
-from fmpy import fmi1, fmi2, fmi3
+from fmpy import fmi2, fmi3
 from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
 from ..errors import FmuError, SimulationError
 from ..export.typed_values import IN_FMI_3
 from .description import Fmu
+from .loading import NAMES, Prepared, loading, unique
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Log levels of the FMI statuses ok, warning, discard and error; fatal is CRITICAL."""
 WARNING = fmi2.fmi2Warning
-LOADING = Lock()
-NAMES: set[str] = set()  # of living instances
 Values = Array[c_double]
-
-
-class _Staying:
-    """The module os with a ``chdir`` that does nothing."""
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(os, name)
-
-    def chdir(self, folder: str) -> None:
-        """Do nothing."""
-
-
-@contextmanager
-def _loading() -> Iterator[None]:
-    """Prevent FMPy from changing the working directory while it loads a library.
-
-    FMPy changes to the library's folder, as Windows requires, which would change the relative paths of all threads.
-    """
-    with LOADING:
-        vars(fmi1)["os"] = _Staying()
-        try:
-            yield
-        finally:
-            vars(fmi1)["os"] = os
-
-
-def _unique(name: str) -> str:
-    """Return the name, or the name and a number if a living instance has it, as FMI demands."""
-    with LOADING:
-        own = next(each for each in chain([name], (f"{name} {k}" for k in count(2))) if each not in NAMES)
-        NAMES.add(own)
-    return own
+Part = tuple[str, "Instance", Prepared | None]
+"""A component, "" for an FMU alone, its instance, and its call; None if C cannot make it."""
 
 
 class Instance:
@@ -83,7 +49,7 @@ class Instance:
 
     def __init__(self, fmu: Fmu, folder: Path, name: str = "") -> None:
         self.fmu = fmu
-        self._said = ""
+        self._said, self._heard = "", c_char()
         self._fatal = self._running = False
         self._ends = c_bool()  # doStep's argument terminateSimulation in FMI 3.0
         self._t, self._h = c_double(), c_double()
@@ -92,9 +58,10 @@ class Instance:
             vector = starts.setdefault((v.type, v.reference), [])
             if v.element == len(vector):  # an alias has the reference of another vector
                 vector.append(v.initial_value)
-        self._starts, self._vectors = starts, deepcopy(starts)  # start and latest values by type and value reference
+        self._starts = starts  # start and latest values by type and value reference
+        self._vectors = {key: [*vector] for key, vector in starts.items()}
         identifier = fmu.description.coSimulation.modelIdentifier
-        self._name = _unique(name or identifier)
+        self._name = unique(name or identifier)
         try:
             self.slave = self._instantiate(
                 guid=fmu.guid, unzipDirectory=str(folder), modelIdentifier=identifier, instanceName=self._name
@@ -108,7 +75,7 @@ class Instance:
     def _instantiate(self, **what: str) -> fmi2.FMU2Slave:
         from fmpy.logging import addLoggerProxy  # missing on aarch64-linux, for which FMI 2.0 has no name
 
-        with _loading():
+        with loading():
             slave = fmi2.FMU2Slave(**what)
         HEARD[id(self)] = self
         self._callbacks = fmi2.fmi2CallbackFunctions(
@@ -151,7 +118,7 @@ class Instance:
         """Reset to the state after instantiation."""
         self._accept(self.slave.reset)
         self._running = False
-        self._vectors = deepcopy(self._starts)
+        self._vectors = {key: [*vector] for key, vector in self._starts.items()}
 
     def set(self, values: Mapping[str, float | bool | str]) -> None:
         """Set variables by name; other elements of a vector keep their last values."""
@@ -172,7 +139,7 @@ class Instance:
         self._t.value, self._h.value = t, h
         status = self._do_step(*self._step_arguments)
         if status > WARNING or self._ends:
-            self._refuse(status)
+            raise self.failure(status)
 
     def _columns(self, names: Sequence[str]) -> tuple[list[int], list[int], int]:
         """Return the value references for Real variables, the variables' indices among all values, and their number."""
@@ -187,20 +154,32 @@ class Instance:
         """Return the number of values as an argument, if this version of FMI has this argument."""
         return ()
 
-    def reader(self, names: Sequence[str], into: Values | None = None) -> Callable[[], Values]:
-        """Return a function that reads Real variables, always into the same buffer, which may be given."""
+    def _access(
+        self, function: Any, names: Sequence[str], values: Values | None
+    ) -> tuple[Callable[[], Values], Values, Values, list[int], list[int]]:
+        """Return a function that reads or sets the vectors of Real variables, and returns their buffer.
+
+        Further results are the variables' buffer, which is that of the vectors if the variables are whole vectors, the
+        vectors' buffer, their value references, and the variables' indices.
+        """
         distinct, columns, size = self._columns(names)
-        values = (c_double * len(columns))() if into is None else into
+        values = (c_double * len(columns))() if values is None else values
         whole = values if columns == [*range(size)] else (c_double * size)()
         references = (c_uint * len(distinct))(*distinct)
-        asked = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
-        get, arguments = self._get, (self._component, *asked)
+        given = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
+        arguments = self._component, *given
 
-        def read() -> Values:
+        def access() -> Values:
             self._said = ""
-            if (status := get(*arguments)) > WARNING:
-                self._refuse(status)
+            if (status := function(*arguments)) > WARNING:
+                raise self.failure(status)
             return whole
+
+        return access, values, whole, distinct, columns
+
+    def reader(self, names: Sequence[str], into: Values | None = None) -> Callable[[], Values]:
+        """Return a function that reads Real variables, always into the same buffer, which may be given."""
+        read, values, whole, _, columns = self._access(self._get, names, into)
 
         def read_elements() -> Values:
             read()
@@ -209,22 +188,12 @@ class Instance:
 
         return read if whole is values else read_elements
 
-    def writer(self, names: Sequence[str], values: Values) -> Callable[[], None]:
+    def writer(self, names: Sequence[str], values: Values) -> Callable[[], object]:
         """Return a function that sets Real variables to the values in a buffer.
 
         Other elements of their vectors keep their last values.
         """
-        distinct, columns, size = self._columns(names)
-        whole = values if columns == [*range(size)] else (c_double * size)()
-        references = (c_uint * len(distinct))(*distinct)
-        given = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
-        put, arguments = self._put, (self._component, *given)
-
-        def write() -> None:
-            self._said = ""
-            if (status := put(*arguments)) > WARNING:
-                self._refuse(status)
-
+        write, _, whole, distinct, _ = self._access(self._put, names, values)
         scalars = [self.fmu.variables[name] for name in names]
 
         def write_elements() -> None:
@@ -235,6 +204,30 @@ class Instance:
 
         return write if whole is values else write_elements
 
+    def prepared(self, names: Sequence[str], address: int, stride: int = 0, *, put: bool = False) -> Prepared | None:
+        """Return a call in C that reads or sets Real variables at an address; None if they are parts of vectors.
+
+        The address of the values grows by ``stride`` numbers with each step.
+        """
+        distinct, columns, size = self._columns(names)
+        if columns != [*range(size)]:
+            return None
+        references = (c_uint * len(distinct))(*distinct)
+        given = references, len(distinct), address, size, stride
+        return self._in_c(self.fmu.version, self._put if put else self._get, *given)
+
+    def prepared_step(self) -> Prepared:
+        """Return the call of doStep in C."""
+        return self._in_c(-self.fmu.version, self._do_step, (c_uint * 1)(), 0, 0, 0, 0)
+
+    def _in_c(self, kind: int, function: Any, *given: Any) -> Prepared:
+        at, heard = cast(function, c_void_p).value, addressof(self._heard)
+        return Prepared(kind, at, self._component, *given, heard)
+
+    def parts(self, names: Sequence[str], address: int) -> list[Part]:
+        """Return the calls of one step that C can make, the last of which read Real variables into rows."""
+        return [("", self, self.prepared_step()), ("", self, self.prepared(names, address, len(names)))]
+
     def value(self, name: str) -> float | bool:
         """Return the value of an Integer or Boolean variable."""
         variable = self.fmu.variables[name]
@@ -242,7 +235,7 @@ class Instance:
         try:
             read = self._getters[variable.type]([variable.reference], *self._of_size(size))[variable.element]
         except FMICallException as error:
-            self._refuse(error.status)
+            raise self.failure(error.status) from error
         return bool(read) if variable.type == "Boolean" else int(read)
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
@@ -261,7 +254,7 @@ class Instance:
         try:
             found = self.slave.getDirectionalDerivative(distinct, references, changes, *self._of_size(size))
         except FMICallException as error:
-            self._refuse(error.status)
+            raise self.failure(error.status) from error
         return np.array(found)[rows]
 
     def free(self) -> None:
@@ -274,12 +267,17 @@ class Instance:
         self.slave.freeInstance()
         NAMES.discard(self._name)
 
-    def _refuse(self, status: int) -> NoReturn:
-        """Raise the error of a call's status, with the FMU's own message, if any."""
+    def failure(self, status: int) -> SimulationError:
+        """Return the error of a call's status, with the FMU's own message, if any."""
         self._fatal = status == fmi2.fmi2Fatal
         outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
         reason = f"a call failed, status {status}" if status > WARNING else "the FMU ends the run"
-        raise SimulationError(self._said or reason, outcome=outcome)
+        return SimulationError(self._said or reason, outcome=outcome)
+
+    def failure_in_c(self, status: int) -> SimulationError:
+        """Return the error of a status of a prepared call; earlier messages are not of this call."""
+        self._said = self._said if self._heard else ""
+        return self.failure(status)
 
     def another(self) -> Instance:
         """Return a second instance, of the same loaded library."""
@@ -303,7 +301,7 @@ class Instance:
         try:
             function(*arguments, **named)
         except FMICallException as error:
-            self._refuse(error.status)
+            raise self.failure(error.status) from error
         if self._said:
             raise SimulationError(self._said)
 
@@ -311,7 +309,7 @@ class Instance:
         """Pass a message of the FMU to the logger, and store that of an error for the exception to come."""
         message = text.decode("utf-8", "replace").strip()
         if status > WARNING:
-            self._said = message
+            self._said, self._heard.value = message, b"\1"
         logger.log(LEVELS.get(status, logging.CRITICAL), message)
 
 
@@ -332,7 +330,7 @@ class Instance3(Instance):
     """An instance of FMI 3.0."""
 
     def _instantiate(self, **what: str) -> fmi3.FMU3Slave:
-        with _loading():
+        with loading():
             slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=lambda _environment, *message: self.log(*message), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())

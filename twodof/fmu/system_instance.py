@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from ctypes import c_double, sizeof
+from ctypes import addressof, c_double, sizeof
 from functools import partial
 from itertools import groupby
 
@@ -23,13 +23,14 @@ from ..errors import FmuError, SimulationError
 from ..export.python_wrapper import check_python_wrapper
 from ..files import temporary_folder
 from .description import Fmu, opened
-from .instance import Instance, Instance3, Values
+from .instance import Instance, Instance3, Part, Values
+from .loading import Prepared
 from .ssp_file import IDENTITY
 from .system import System
 from .wiring import Link, Node
 
-Move = tuple[str, Callable[[], object]]
-"""A component, and a function that reads its outputs or sets its inputs."""
+Move = tuple[str, Callable[[], object], Prepared | None]
+"""A component, a function that reads its outputs or sets its inputs, and the same call in C if it is one call."""
 READ = ("documentation/", "sources/")
 """Folders of an FMU that its library does not need."""
 
@@ -46,7 +47,7 @@ class SystemInstance:
         self._discrete: dict[Node, float | bool] = {}
         self._moves, _ = self._in_order(system.batches)
         self._initial, self._signals = self._in_order(system.initial)
-        self._steps = [(name, instance.step) for name, instance in instances.items()]
+        self._steps = [(name, instance.step, instance.prepared_step()) for name, instance in instances.items()]
         self._due = True
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool | str]) -> None:
@@ -96,18 +97,33 @@ class SystemInstance:
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
         """Return a function that reads Real variables, always into the same buffer."""
-        nodes, first = [self._system.places[name] for name in names], 0
-        values, reads = (c_double * len(nodes))(), []
-        for element, group in groupby(nodes, key=lambda node: node.element):
-            own = [node.connector for node in group]
-            reads.append((element, self._instances[element].reader(own, _part(values, first, len(own)))))
-            first += len(own)
+        values = (c_double * len(names))()
+        reads = [
+            (element, self._instances[element].reader(own, _part(values, first, len(own))), None)
+            for element, first, own in self._columns(names)
+        ]
 
         def read_all() -> Values:
             self._each(reads)
             return values
 
         return read_all if len(reads) > 1 else reads[0][1]
+
+    def parts(self, names: Sequence[str], address: int) -> list[Part]:
+        """Return the calls of one step that C can make, the last of which read Real variables into rows."""
+        calls = [(element, call) for element, _, call in [*self._steps, *self._moves]]
+        for element, first, own in self._columns(names):
+            place = address + first * sizeof(c_double)
+            calls.append((element, self._instances[element].prepared(own, place, len(names))))
+        return [(element, self._instances[element], call) for element, call in calls]
+
+    def _columns(self, names: Sequence[str]) -> Iterator[tuple[str, int, list[str]]]:
+        """Yield components, the index of the first of their variables, and the variables' names there."""
+        nodes, first = [self._system.places[name] for name in names], 0
+        for element, group in groupby(nodes, key=lambda node: node.element):
+            own = [node.connector for node in group]
+            yield element, first, own
+            first += len(own)
 
     def _propagate(self) -> None:
         """Pass the outputs of this instant to the inputs."""
@@ -127,12 +143,11 @@ class SystemInstance:
         why = "it is in an algebraic loop, or has another value at each read; `twodof check` tries its FMU"
         raise SimulationError(f"'{changed[0]}' changes with each evaluation in initialisation mode: {why}")
 
-    def _each(self, calls: Sequence[tuple[str, Callable[..., object]]], *arguments: float) -> None:
+    def _each(self, calls: Sequence[tuple[str, Callable[..., object], Prepared | None]], *arguments: float) -> None:
         """Run functions in order; an error names the component."""
         name = ""
         try:
-            for each in calls:
-                name, call = each
+            for name, call, _ in calls:  # noqa: B007
                 call(*arguments)
         except SimulationError as error:
             raise SimulationError(f"'{name}': {error}", outcome=error.outcome) from error
@@ -154,14 +169,15 @@ class SystemInstance:
             if sources := [node for node in reals if node not in incoming]:
                 first = len(columns)
                 columns |= {node: first + i for i, node in enumerate(sources)}
-                part = _part(signals, first, len(sources))
-                yield element, instance.reader([node.connector for node in sources], part)
+                part, names = _part(signals, first, len(sources)), [node.connector for node in sources]
+                yield element, instance.reader(names, part), instance.prepared(names, addressof(part))
             if sinks:
                 rows = sorted((columns[link.source], link) for link in sinks)
-                yield element, _writer(instance, rows, signals)
+                yield element, *_writer(instance, rows, signals)
             for node in (node for node in own if node not in reals):
                 move = self._set_one if node in incoming else self._read_one
-                yield element, partial(move, instance, node, incoming[node].source if node in incoming else node)
+                source = incoming[node].source if node in incoming else node
+                yield element, partial(move, instance, node, source), None
 
     def _read_one(self, instance: Instance, node: Node, _node: Node) -> None:
         self._discrete[node] = instance.value(node.connector)
@@ -170,12 +186,18 @@ class SystemInstance:
         instance.set({node.connector: self._discrete[source]})
 
 
-def _writer(instance: Instance, rows: Sequence[tuple[int, Link]], signals: Values) -> Callable[[], None]:
-    """Return a function that sets inputs from columns of signals; equal signals in order are not copied."""
+def _writer(
+    instance: Instance, rows: Sequence[tuple[int, Link]], signals: Values
+) -> tuple[Callable[[], object], Prepared | None]:
+    """Return a function that sets inputs from columns of signals; equal signals in order are not copied.
+
+    For these, the second result is the same call in C.
+    """
     names, first = [link.target.connector for _, link in rows], rows[0][0]
     equal = all(link.map == IDENTITY for _, link in rows)
     if equal and [column for column, _ in rows] == [*range(first, first + len(rows))]:
-        return instance.writer(names, _part(signals, first, len(rows)))
+        part = _part(signals, first, len(rows))
+        return instance.writer(names, part), instance.prepared(names, addressof(part), put=True)
     values = (c_double * len(rows))()
     write, maps = instance.writer(names, values), [(link.map, column) for column, link in rows]
 
@@ -183,7 +205,7 @@ def _writer(instance: Instance, rows: Sequence[tuple[int, Link]], signals: Value
         values[:] = [affine.of(signals[column]) for affine, column in maps]
         write()
 
-    return move
+    return move, None
 
 
 def _part(values: Values, first: int, size: int) -> Values:

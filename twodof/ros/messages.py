@@ -220,11 +220,10 @@ class Messages:
             given = (*given, *sample.quat, *self._target)
         return self._pack(sample.stamp, *sample.q, *sample.v, *given)
 
-    def numbers_of(self, rows: bytes, first: Sample, k: int) -> bytes:
+    def numbers_of(self, values: NDArray[np.float64], first: Sample, k: int) -> bytes:
         """Return the packed numbers of samples from index k on, by their OUTPUTS and the inputs of the first sample."""
         sizes = [len(getattr(first, name)) for name in OUTPUTS]
-        values, begin = np.frombuffer(rows).reshape(-1, sum(sizes)), 0
-        table = np.zeros(len(values), self._numbers)
+        table, begin = np.zeros(len(values), self._numbers), 0
         later = np.rint(np.arange(k, k + len(values)) * self._step * NANOSECONDS)
         table["stamp"] = first.stamp + later.astype(np.int64)
         for name, size in zip(OUTPUTS, sizes):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import InputError, SimulationError
-from ..fmu import Fmu, Instance, SystemInstance, instantiate
+from ..fmu import Fmu, Instance, SystemInstance
 from ..notebook import in_notebook
 from ..signatures import ignore, never, with_keywords_of
 from .experiments import Experiment, ExperimentOptions, experiment
@@ -22,9 +22,9 @@ from .progress import Progress
 from .removal import Repeat
 from .repetition import Repeater, is_repeatable
 from .run_summary import Summary
-from .sample import Sample, Sink
+from .sample import Sample, Sink, TakeRows
 from .setup import robot_of
-from .stepping import Resume, Stop, as_experiment, far_target, judge_of, stepped, stepped_rows
+from .stepping import Resume, Stop, as_experiment, far_target, judge_of, stepped
 from .verdict import conclude
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def simulate(
     Other arguments and errors as in ``samples``.
 
     Args:
+        stop: as in ``samples``, but after up to 256 short steps if the inputs do not change.
         steer: called after each sample; returns new inputs, which apply from that sample's time on. Inputs
             that a sink commands take precedence.
     """
@@ -115,10 +116,10 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
         InputError: their times differ.
         FmuError, SimulationError: as ``simulate``.
     """
-    if len(members) == 1 and members[0].takes_rows and pace is None:
-        return [_simulate_rows(members[0], stop)]
     times = {(run.start_time, run.step, run.steps, run.stamp_start) for run, *_ in members}
     start, stamp, ended = members[0].run.start_time, members[0].run.stamp_start, False
+    rows: list[TakeRows] | None = [] if len(members) == 1 and members[0].takes_rows and pace is None else None
+    halt = stop if rows is not None else lambda: ended
     if len(times) > 1 or (stamp is None and len(members) > 1):
         raise InputError("runs in one loop need equal start time, step, stop time and first stamp")
     with ExitStack() as stack:
@@ -134,7 +135,7 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
             stack.enter_context(_explaining(*judges))
         for member, judge in zip(members, judges):
             ready = begin if member is members[-1] else lambda: None
-            source = stepped(member.run, judge, None, lambda: ended, ready, member.resumed, member.instance)
+            source = stepped(member.run, judge, None, halt, ready, member.resumed, member.instance, rows)
             sources.append(stack.enter_context(closing(source)))
         latest = [next(source) for source in sources]
         for member, first in zip(members, latest):
@@ -143,6 +144,8 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
         sends, steers = [s.send for s in sources], [m.steered(pace, stop) for m in members]
         writes = [(k, sink.write) for k, member in enumerate(members) for sink in member.sinks]
         started = time.perf_counter()
+        if rows is not None:
+            writes, rows[:] = [], [sink.take_rows(latest[0]) for sink in members[0].sinks]
         while True:
             if pace is not None:
                 pace.wait(latest[0].t - start, stop)
@@ -155,13 +158,11 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
             except StopIteration:
                 break
         taken = time.perf_counter() - started
-        summaries = [
-            Summary(s, taken, s.k < member.run.steps, j, member.repeat(s, stop))
-            for s, member, j in zip(latest, members, judges)
-        ]
-        for summary, (_, sinks, *_) in zip(summaries, members):
-            for sink in sinks:
-                sink.conclude(partial(getattr, summary, "verdict"))
+        summaries: list[Summary] = []
+        for last, member, judge in zip(latest, members, judges):
+            summaries.append(Summary(last, taken, last.k < member.run.steps, judge, member.repeat(last, stop)))
+            for sink in member.sinks:
+                sink.conclude(partial(getattr, summaries[-1], "verdict"))
     return summaries
 
 
@@ -178,32 +179,3 @@ def _explaining(judge: Judge) -> Iterator[None]:
         if not causes:
             raise
         raise SimulationError(f"{error}; until then: {causes[0].text}", error.k, error.outcome) from error
-
-
-def _simulate_rows(member: Member, stop: Stop) -> Summary:
-    """Run an FMU whose sinks receive rows of outputs; errors as of ``simulate_together``."""
-    run, sinks, *_ = member
-    judge, started = judge_of(run, robot_of(run.fmu.urdf)), 0.0
-    with ExitStack() as stack:
-        stack.enter_context(_explaining(judge))
-        running = stack.enter_context(ExitStack())  # on an error, sinks end before the instance does
-        instance = member.instance or running.enter_context(instantiate(run.fmu))
-
-        def begin() -> None:
-            for sink in [sink.begin(run) for sink in sinks]:
-                stack.enter_context(sink)
-
-        def first(sample: Sample) -> list[Callable[[bytes], object]]:
-            nonlocal started
-            if doubt := far_target(sample):
-                LOG.warning(f"'{run.fmu.path}': {doubt}")
-            started = time.perf_counter()
-            return [sink.take_rows(sample) for sink in sinks]
-
-        last = stepped_rows(run, judge, stop, begin, first, instance)
-        running.close()
-        taken = time.perf_counter() - started
-        summary = Summary(last, taken, last.k < run.steps, judge, member.repeat(last, stop))
-        for sink in sinks:
-            sink.conclude(partial(getattr, summary, "verdict"))
-    return summary

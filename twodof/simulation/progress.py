@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from ..notebook import in_notebook
-from .sample import Sample, Sink
+from .sample import Sample, Sink, TakeRows
 
 if TYPE_CHECKING:
     from .experiments import Experiment
@@ -59,10 +59,10 @@ class Progress(Sink):
         """Show the time of a sample."""
         self._bar.update(self._step if sample.k else 0.0)
 
-    def take_rows(self, first: Sample) -> Callable[[bytes], object]:
-        """Show the time of the first sample; return a function that shows that of each further one."""
+    def take_rows(self, first: Sample) -> TakeRows:
+        """Show the time of the first sample; return a function that shows that of further ones."""
         self.write(first)
-        return lambda _: self._bar.update(self._step)
+        return lambda rows: self._bar.update(self._step * len(rows))
 
     def __exit__(self, *exception: object) -> None:
         self._bar.close()

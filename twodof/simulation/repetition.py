@@ -83,7 +83,9 @@ def _changed(run: Experiment, plan: Repetition) -> Experiment:
 def _judged(run: Experiment, instance: Instance | SystemInstance, stop: Stop) -> Judge | None:
     judge = judge_of(run, robot_of(run.fmu.urdf))
     try:
-        (last,) = deque(stepped(run, judge, None, stop, ignore, ignore, instance), maxlen=1)
+        (last,) = deque(
+            stepped(run, judge, None, stop, ignore, ignore, instance, None if run.changes else ()), maxlen=1
+        )
     except SimulationError:
         return None
     finally:

@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping
 from math import hypot
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import SimulationError
 from .experiments import Experiment
 from .input_values import Setting, Value
@@ -14,6 +17,9 @@ from .verdict import Verdict
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+TakeRows = Callable[[NDArray[np.float64]], object]
+"""Function that receives OUTPUTS of consecutive samples side by side, N × values."""
 
 
 class Sample(NamedTuple):
@@ -109,8 +115,8 @@ class Sink:
     def write(self, sample: Sample) -> None:
         """Receive one sample."""
 
-    def take_rows(self, first: Sample) -> Callable[[bytes], object]:
-        """Receive the first sample; return a function that receives OUTPUTS of each further one, as 64-bit numbers."""
+    def take_rows(self, first: Sample) -> TakeRows:
+        """Receive the first sample; return a function that receives the OUTPUTS of further ones."""
         raise NotImplementedError
 
     def command(self, stop: Callable[[], bool], pace: RealTime | None) -> Mapping[str, Setting] | None:

@@ -8,6 +8,7 @@ The initial state is the first sample, so N steps give N + 1 samples.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import nullcontext
@@ -17,15 +18,17 @@ from pathlib import Path
 from struct import Struct
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..errors import InputError, SimulationError, diverged, step_failure
-from ..fmu import Fmu, Instance, SystemInstance, instantiate
+from ..fmu import SPAN, Fmu, Instance, SystemInstance, advancing, instantiate
 from ..plant.urdf import Urdf
 from ..signatures import ignore, never, with_keywords_of
 from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
 from .input_values import Setting, Value, resolve
 from .judge import BLOCK, OUTPUTS, Judge
 from .pace import RealTime
-from .sample import Sample
+from .sample import Sample, TakeRows
 from .setup import setup_of
 
 if TYPE_CHECKING:
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 OF_A_SAMPLE = (*OUTPUTS, "q_meas", "v_meas")
 LARGE = 1e5  # in a setting's unit: larger settings are probably mistakes
 FAR = 50.0  # m: a target farther from the end effector is probably in millimetres
+FAST = 2e-4  # s of wall time: between longer steps, signals are handled
 
 
 Stop = Callable[[], bool]
@@ -84,24 +88,32 @@ def stepped(
     ready: Callable[[], object],
     resume: Resume,
     instance: Instance | SystemInstance | None,
+    rows: Sequence[TakeRows] | None = None,
 ) -> Samples:
-    """Yield the samples of a run; the judge receives the outputs of each as a buffer."""
+    """Yield the samples of a run; the judge receives the outputs of each as a buffer.
+
+    With ``rows``, functions that receive rows of outputs, inputs must not change. Then only the first and the last
+    sample are made: a sample takes as long as a step of a fast FMU. The functions may come after the first one.
+    """
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
         instance.initialise(run.start_time, run.time(run.steps), {**run.given, **run.texts})
         ready()
-        take, since = _sampler(instance, run, ignore if judge is None else judge.rows.write), run.start_time
-        full = 0
+        (take, judged), since = _sampler(instance, run), run.start_time
         for k in count():
             sample = take(k, inputs, since)
-            if k == full and judge is not None:
-                judge.flush()
-                full += BLOCK
+            if judge is not None:
+                judge.rows.write(judged)
+                if not k % BLOCK:
+                    judge.flush()
             if pace is not None:
                 pace.wait(sample.t - run.start_time, stop)
             answer = yield sample
             if k == run.steps or stop():
+                return
+            if rows is not None and judge is not None:
+                yield take(_step_in_spans(run, judge, stop, instance, sample, rows), inputs, since)
                 return
             try:
                 if answer or due:
@@ -125,49 +137,39 @@ def stepped(
                 instance.step(since, run.step)
 
 
-def stepped_rows(
+def _step_in_spans(
     run: Experiment,
     judge: Judge,
     stop: Stop,
-    ready: Callable[[], object],
-    first: Callable[[Sample], Sequence[Callable[[bytes], object]]],
     instance: Instance | SystemInstance,
-) -> Sample:
-    """Step an FMU whose inputs do not change, and return the last sample.
-
-    It makes no samples between the first and the last one, which take as long as a step of a fast FMU.
-
-    Args:
-        run, judge, stop, ready, instance: as of ``stepped``.
-        first: receives the first sample; returns functions that receive the outputs of each further one as bytes.
-    """
-    inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
-    instance.initialise(run.start_time, run.time(run.steps), {**run.given, **run.texts})
-    ready()
-    take, start, h, step = _sampler(instance, run, ignore), run.start_time, run.step, instance.step
-    sample = take(0, inputs, start)
-    groups = [run.fmu.vector(group) for group in OUTPUTS]
-    read, unpack = instance.reader([*chain(*groups)]), Struct(f"{sum(map(len, groups))}d").unpack
-    row, k, watch = bytes(read()), 0, judge.rows.write
-    watch(row)
-    judge.flush()
-    adds = first(sample)
-    while k < run.steps and not stop():
-        try:
-            step(start + k * h, h)
-        except SimulationError as error:
-            sample_of = _maker(run, [*accumulate(len(run.fmu.vector(group)) for group in OF_A_SAMPLE)], sample.stamp)
-            _resumed(run, sample_of(k, unpack(row), inputs, start), error, ignore)
-        row, k = bytes(read()), k + 1
-        values = unpack(row)
-        if not isfinite(sum(values)) and not all(map(isfinite, values)):
-            raise diverged(k, run.time(k))
-        watch(row)
-        for add in adds:
-            add(row)
+    first: Sample,
+    takers: Sequence[TakeRows],
+) -> int:
+    """Step from the first sample on; pass rows of outputs to judge and functions; return the index of the last step."""
+    sizes = [len(run.fmu.vector(group)) for group in OUTPUTS]
+    advance = advancing(instance, [*chain(*map(run.fmu.vector, OUTPUTS))], run.start_time, run.step)
+    k, span, last = 0, 1, np.empty((0, sum(sizes)))
+    while True:
+        begin, size = time.perf_counter(), int(min(span, run.steps - k, BLOCK - k % BLOCK))
+        rows, error = advance(k, size)
+        fast = time.perf_counter() - begin < FAST * size
+        finite = rows if np.isfinite(rows[-1:]).all() else rows[:-1]
+        if len(finite):
+            judge.rows.write(finite.data)
+            for take in takers:
+                take(finite)
+            k, last = k + len(finite), finite
+        if len(rows) > len(finite):
+            raise diverged(k + 1, run.time(k + 1))
+        if error is not None:
+            sample_of = _maker(run, [*accumulate(sizes), *[sum(sizes)] * 2], first.stamp)
+            sample = sample_of(k, tuple(last[-1].tolist()), first.inputs, first.since) if k else first
+            _resumed(run, sample, error, ignore)
         if not k % BLOCK:
             judge.flush()
-    return take(k, inputs, start)
+        if k == run.steps or stop():
+            return k
+        span = SPAN if fast else 1
 
 
 def as_experiment(
@@ -188,13 +190,15 @@ def as_experiment(
 
 
 def _sampler(
-    instance: Instance | SystemInstance, run: Experiment, watch: Callable[[memoryview], object]
-) -> Callable[[int, Mapping[str, Value], float], Sample]:
-    """Return a function that reads the outputs after k steps, with the inputs and their start time."""
+    instance: Instance | SystemInstance, run: Experiment
+) -> tuple[Callable[[int, Mapping[str, Value], float], Sample], memoryview]:
+    """Return a function that reads the outputs after k steps, with the inputs and their start time.
+
+    The second result is a view of the latest OUTPUTS.
+    """
     groups = [run.fmu.vector(group) for group in OF_A_SAMPLE]
     ends = list(accumulate(map(len, groups)))
     read, unpack = instance.reader([*chain(*groups)]), Struct(f"{ends[-1]}d").unpack
-    judged = memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # a view of the buffer that all reads use
     signals = instance.reader(run.signals) if run.signals else tuple
     sample_of = _maker(run, ends, run.first_stamp())
 
@@ -202,10 +206,9 @@ def _sampler(
         values = unpack(read())
         if not isfinite(sum(values)) and not all(map(isfinite, values)):
             raise diverged(k, run.time(k))
-        watch(judged)
         return sample_of(k, values, inputs, since, tuple(signals()))
 
-    return take
+    return take, memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # all reads use one buffer
 
 
 def _maker(run: Experiment, ends: Sequence[int], first_stamp: int) -> Callable[..., Sample]:
