@@ -86,25 +86,39 @@ def oscillation(t):
 
 
 @pytest.mark.parametrize("python", [False, True])
-@pytest.mark.parametrize("h", [1e-3, 7e-3, 5e-2])
+@pytest.mark.parametrize("h", [1e-3, 7e-3, 2e-2, 5e-2])
 def test_a_coulomb_oscillator_turns_where_and_when_its_closed_form_does(h, python):
+    """Turn k is at kπ/ω and ±(x₀ − 2kF/(m Kp)); the last one is within ±F/(m Kp), where the joint stays."""
     native = slider("joint")
     plant = native.model.plant()
     assert plant.friction == [FRICTION]
-    changes = {"gravity": [0.0] * 3, "q": [START], "v": [0.0], "Kp": [KP], "Kd": [0.0], "q_des": [0.0], **TIGHT}
+    changes = {"gravity": [0.0] * 3, "Kp": [KP], "Kd": [0.0], "q_des": [0.0], **TIGHT}
     for name, value in changes.items():
         setattr(plant, name, value)
     plant.prepare()
-    turns, end = np.pi / np.sqrt(KP), 6.0 if h > 1e-3 or not python else 1.2
-    signs, last = [], 0.0
-    for k, (q, v) in enumerate(states(native, plant, h, round(end / h), python=python), start=1):
-        assert (*q, *v) == pytest.approx(oscillation(k * h), abs=1e-9)
-        if v[0] and np.sign(v[0]) != last:
-            last = np.sign(v[0])
-            signs.append(k * h)
-    assert all(abs(t - i * turns) <= h + 1e-12 for i, t in enumerate(signs))
+
+    def after(state, passed):
+        plant.q, plant.v = map(list, state)
+        return next(states(native, plant, passed, 1, python=python))
+
+    turns = np.arange(1, 12) * np.pi / np.sqrt(KP)
+    places = [(-1) ** k * (START - 2 * k * FRICTION / (MASS * KP)) for k in range(1, 12)]
+    assert abs(places[-1]) < FRICTION / (MASS * KP) < abs(places[-2])
+    state, end, passed = ([START], [0.0]), 6.0 if h > 1e-3 or not python else 1.2, 0
+    for k in range(round(end / h)):
+        while passed < len(turns) and turns[passed] < (k + 1) * h:
+            for late in (-1e-9, 1e-9):
+                q, v = after(state, turns[passed] - k * h + late)
+                assert q[0] == pytest.approx(places[passed], abs=1e-9)
+                stays = late > 0.0 and passed == len(turns) - 1
+                assert np.sign(v[0]) == (0.0 if stays else (-1) ** (passed + (late < 0.0)))
+            passed += 1
+        state = after(state, h)
+        assert np.ravel(state) == pytest.approx(oscillation((k + 1) * h), abs=1e-9)
+    assert passed == (len(turns) if end == 6.0 else 2)
     if end == 6.0:
-        assert v[0] == 0.0 and len(signs) == 11  # and it stays exactly where it is
+        assert np.ravel(state) == pytest.approx([places[-1], 0.0], abs=1e-9)
+        assert (np.ravel(after(state, h)) == np.ravel(state)).all() and state[1][0] == 0.0
 
 
 # --- against the oracle ---

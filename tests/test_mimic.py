@@ -86,6 +86,10 @@ def test_a_mimic_of_a_mimic_follows_the_joint_that_moves() -> None:
     assert (robot.joints, robot.prismatic, robot.effort) == (("turn",), (False,), (7.0,))
     assert (*robot.q_min, *robot.q_max) == pytest.approx((0.2, 0.6), abs=1e-15)
     assert robot.damping == pytest.approx((0.5 + 3.0,))
+    rough = HAND.replace("<dynamics ", '<dynamics friction="0.25" ').replace(
+        '<mimic joint="turn"', '<dynamics friction="2"/><mimic joint="turn"'
+    )
+    assert load_robot(rough, "tip", "xyz").friction == pytest.approx((0.25 + 0.25 + 2.0 * 2.0,))
     q, v = 0.35, 1.7
     mechanism = Mechanism(robot, (0.0, -9.81, 0.0), 0.0, (0.0,) * 3, (0.0,))
     place, J, drift = mechanism.observe(np.array([q]), np.array([v]))
