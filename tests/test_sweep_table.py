@@ -5,6 +5,7 @@ import os
 import random
 import re
 import signal
+import struct
 import subprocess
 import time
 from collections.abc import Callable
@@ -270,6 +271,41 @@ def test_hostile_table_gets_one_line_in_little_memory(sound, tmp_path, make):
     finally:
         pa.set_memory_pool(usual)
     assert READING.max_memory() < 64 * 1024**2
+
+
+def footer(schema: bytes, elements: int, groups: int, columns: int) -> bytes:
+    """A Parquet file of a schema, and of groups of columns without any fact, by Thrift's compact protocol."""
+
+    def number(value: int) -> bytes:
+        head = b""
+        while value > 127:
+            head, value = head + bytes([value & 127 | 128]), value >> 7
+        return head + bytes([value])
+
+    root = b"\x48\x01r\x15" + number(2 * elements) + b"\0"
+    group = b"\x19\xfc" + number(columns) + b"\x26\0\0" * columns + b"\x16\0\x16\0\0"
+    content = b"\x15\x02\x19\xfc" + number(elements + 1) + root + schema * elements
+    content += b"\x16\0\x19\xfc" + number(groups) + group * groups + b"\0"
+    return b"PAR1" + content + struct.pack("<I", len(content)) + b"PAR1"
+
+
+COLUMN = b"\x15\0\x25\x02\x18\x01a\0"
+FOOTERS = {"columns": (900_000, 1, 1), "columns of groups": (1, 4, 900_000), "groups": (1, 4_000_000, 0)}
+
+
+@pytest.mark.parametrize("shape", FOOTERS.values(), ids=FOOTERS)
+def test_the_footer_of_a_table_takes_little_memory(shape, tmp_path):
+    """Each of these files has some megabytes; Arrow takes gigabytes, or aborts."""
+    (tmp_path / "runs.parquet").write_bytes(footer(COLUMN, *shape))
+    program = (
+        f"import re, twodof\ntry: twodof.read_sweep({str(tmp_path)!r})\n"
+        "except twodof.TwoDofError as error: print(error)\n"
+        "print(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1])"
+    )
+    done = python("-c", program)
+    assert done.returncode == 0, done.stderr
+    refusal, peak = done.stdout.splitlines()
+    assert "cannot read" in refusal and int(peak) < 400_000  # KiB
 
 
 def links(folder: Path, victims: Path) -> dict[str, tuple[Path, Path]]:

@@ -39,6 +39,8 @@ SHAPE = {
 OUTCOMES = ("finished", "discarded", "diverged", "failed", "crashed")
 TEXTS = ["outcome", "message"]
 NUMBER_SIZE = 8  # bytes in memory
+FOOTER = {"thrift_string_size_limit": 2 * MAX_PROVENANCE, "thrift_container_size_limit": 1000}
+"""Limits of texts and of lists, such as columns, in a footer. Without them Arrow aborts where it has too many."""
 
 
 def schema_of(names: Sequence[str], units: Sequence[str], provenance: dict[str, object]) -> pa.Schema:
@@ -84,11 +86,12 @@ def read_tables(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
     for file in files:
         try:
             check_file(named(file), MAX_SWEEP)
-            schema = pq.read_schema(file)
-            runs = _check_schema(file, schema)
-            with pq.ParquetFile(file, read_dictionary=TEXTS) as stored:
-                _check_size(file, stored.metadata, runs, room)
-                with memory_for(3 * MAX_SWEEP):  # a page may have more than the file states
+            with memory_for(3 * MAX_SWEEP):  # a footer takes 240 times its size; a page may have more than it states
+                with pq.ParquetFile(file, **FOOTER) as stored:
+                    schema = stored.schema_arrow
+                runs = _check_schema(file, schema)
+                with pq.ParquetFile(file, read_dictionary=TEXTS, **FOOTER) as stored:
+                    _check_size(file, stored.metadata, runs, room)
                     table = stored.read(use_threads=False)
             room -= table.nbytes + sum(_expanded(table.column(name)) for name in TEXTS)
             if room < 0:
