@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from harness import python
 
 import twodof
 from twodof.cli.main import main
@@ -226,3 +227,15 @@ def test_a_pipe_or_a_device_with_the_name_of_an_output_is_not_read(make, tmp_pat
     make(tmp_path / "x.png")
     assert head_of(tmp_path / "x.png", 100) == b""
     assert free_name(str(tmp_path / "x"), ".png", is_page) == tmp_path / "x-2.png"
+
+
+def test_the_next_writer_removes_the_file_of_a_killed_one(tmp_path):
+    program = (
+        "import os, pathlib, twodof.files as files\n"
+        "content = (os.kill(os.getpid(), 9) if k else b'1' for k in range(2))\n"
+        "files.write_file(pathlib.Path('new.csv'), content)"
+    )
+    assert python("-c", program, cwd=tmp_path).returncode == -9
+    assert len([*tmp_path.iterdir()]) == 1
+    write_file(tmp_path / "new.csv", b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["new.csv"]

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import re
-import secrets
 import shutil
 import stat
 import sys
@@ -169,17 +168,12 @@ def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
         return
     if mode:
         check_file(path, sys.maxsize)
-    partial = target.with_name(f".twodof-{secrets.token_hex(8)}")
-    new = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-    try:
-        with open(new, "wb") as file:
+    with temporary_folder(target.parent) as folder:
+        with open(folder / "partial", "xb") as file:
             if mode and own:
-                os.fchmod(new, stat.S_IMODE(mode) & 0o777)
+                os.fchmod(file.fileno(), stat.S_IMODE(mode) & 0o777)
             file.writelines([content] if isinstance(content, bytes) else content)
-        os.replace(partial, target)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+        os.replace(folder / "partial", target)
 
 
 def descriptor_of(path: str | Path) -> int | None:
