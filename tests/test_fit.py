@@ -284,7 +284,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
     elif change == "no efforts":
         effort = None
     elif change == "slow":
-        stamps = 10**18 + 200_000_000 * np.arange(len(q))
+        stamps = 10**18 + 52_000_000 * np.arange(len(q))
     return q, effort, stamps, names
 
 
@@ -305,7 +305,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("repeated", "several joint states at one time"),
         ("set back", "was the clock set back"),
         ("no efforts", "has no efforts"),
-        ("slow", "a fit needs 20"),
+        ("slow", "has 19.2 joint states a second; a fit needs 20"),
     ],
 )
 def test_a_recording_that_cannot_be_fitted_is_refused_in_a_line(change, words, motion, tmp_path, capsys):
@@ -351,16 +351,38 @@ def test_a_bag_that_is_given_twice_is_refused(bag):
         twodof.fit(ARM, bag, FREE, gravity=(0.0, float("nan"), 0.0))
 
 
-@pytest.mark.parametrize(("gravity", "friction"), [((0.0, 0.0, -9.81), [4.0, 3.0]), (GRAVITY, [0.1, 30.0])])
-def test_efforts_of_friction_alone_are_not_taken_for_another_unit(gravity, friction, tmp_path):
-    """Joints about the vertical carry no load, and gears may have much more friction than their joint has load."""
-    model, t = pin.buildModelFromUrdf(str(ARM)), 0.01 * np.arange(3000)[:, None]
+@pytest.mark.parametrize(
+    ("gravity", "given", "friction"),
+    [
+        ((0.0, 0.0, -9.81), (0.0, 0.0, -9.81), [4.0, 3.0]),
+        (GRAVITY, GRAVITY, [0.1, 30.0]),
+        (GRAVITY, GRAVITY, [0.5, 0.4]),
+        (GRAVITY, (0.0, 0.0, 0.0), [0.5, 0.4]),
+    ],
+    ids=["no load", "much friction", "tiny load", "gravity of 0"],
+)
+def test_efforts_of_friction_are_not_taken_for_another_unit(gravity, given, friction, tmp_path):
+    """Joints about the vertical carry no load, but by rounding a tiny one; gears may have more friction than load."""
+    urdf, t = tmp_path / "arm.urdf", 0.01 * np.arange(3000)[:, None]
+    urdf.write_text(ARM.read_text("utf-8").replace('rpy="0 0 0"', 'rpy="1e-6 2e-6 0"'), "utf-8")
+    model = pin.buildModelFromUrdf(str(urdf))
     model.gravity.linear = np.array(gravity)
     data, w = model.createData(), np.array([0.9, 1.3])
     q, v, a = np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)
     tau = np.array([pin.rnea(model, data, *each) for each in zip(q, v, a)]) + friction * np.sign(v)
-    found = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, tau), "friction[*]", gravity=gravity)
-    assert [each.after for each in found.parameters] == pytest.approx(friction, rel=0.01)
+    found = twodof.fit(urdf, bag_of(tmp_path / "bag", JOINTS, q, tau), "friction[*]", gravity=given)
+    if given == gravity:
+        assert [each.after for each in found.parameters] == pytest.approx(friction, rel=0.01)
+    else:
+        assert not found.explains
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1000.0, "a factor of 1000"), (0.0, "is 0 through")])
+def test_the_bag_whose_efforts_have_another_unit_is_named(factor, words, bag, motion, tmp_path):
+    q, effort = noisy(motion, 1)
+    second = bag_of(tmp_path / "second", JOINTS, q[:2000], factor * effort[:2000])
+    with pytest.raises(InputError, match=rf"second': .*{re.escape(words)}"):
+        twodof.fit(ARM, [bag, second], FREE, gravity=GRAVITY)
 
 
 def test_masses_near_zero_are_refused_in_a_line(bag, tmp_path):

@@ -24,6 +24,7 @@ PASSES, FIRST_NOISE = 6, 0.02
 """Number of estimates of the noise variances, and the initial noise, as a fraction of the efforts."""
 DELAY_SCALE, LARGEST_SHIFT = 0.02, 5e-4
 """Scale of the delay, and its largest change without new rows, s."""
+LARGEST_TURN = 0.01  # rad or m: largest change of an offset after the last linearisation of the rows
 FEWEST = 20  # rows for the estimate of a bin's noise
 PRIOR_SHARE = 0.1
 """Share of the prior in the variance of a value, above which the data do not determine the value."""
@@ -122,7 +123,8 @@ def estimate(
         dynamics = parameters.dynamics(parameters.values(z[:-1]))
         sd = [_deviations(each, residual(each, dynamics, float(z[-1]))) for each in rows]
         finished()
-    converged = bool(solved.status > 0 and abs(z[-1] - rows[0].about[1]) <= LARGEST_SHIFT)
+    shift, turn = abs(z[-1] - rows[0].about[1]), np.abs(dynamics.offset - rows[0].about[0]).max()
+    converged = bool(solved.status > 0 and shift <= LARGEST_SHIFT and turn <= LARGEST_TURN)
     return _result(parameters, rows, sd, z, scales, converged)
 
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 SURE, SEPARATE = 10.0, 1e-6
 """Standard deviations above 0, and relative singular value, from which on data determine a load."""
+LEAST_LOAD = 1e-3
+"""Load of a joint by gravity in one direction, as part of that in others, below which it is an error of rounding."""
 WRONG_UNITS = 300.0
 """Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
 WRONG_RANGE = 3.0
@@ -128,7 +130,9 @@ def fit(
     recordings = _recordings(bags)
     parameters = model.parameters(_recorded_gravity(recordings) if gravity is None else tuple(gravity))
     fitted, held = stretches(recordings, model.robot)
-    _check_units(parameters, fitted)
+    for bag, recording in enumerate(recordings):
+        if own := [stretch for stretch in fitted if stretch.bag == bag]:
+            _check_units(parameters, own, shown(recording.path))
     finished = _counter(progress, PASSES + 2 * len(held))
     found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
@@ -171,8 +175,8 @@ def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
     return tuple(float(starts.get(f"gravity[{k + 1}]", GRAVITY[k])) for k in range(3))
 
 
-def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
-    """Refuse positions far beyond the URDF's range, and efforts that differ much from those of its masses.
+def _check_units(parameters: Parameters, fitted: Sequence[Stretch], bag: str) -> None:
+    """Refuse positions of a bag far beyond the URDF's range, and efforts that differ much from those of its masses.
 
     Raises:
         InputError: the message has the positions or the ratio.
@@ -184,8 +188,8 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
         low, high = robot.q_min[i], robot.q_max[i]
         if not robot.prismatic[i] and most - least > WRONG_RANGE * (high - low) > 0.0:
             raise InputError(
-                f"the positions of joint '{joint}' are between {least:.3g} and {most:.3g}, and its limits {low:.3g} and"
-                f" {high:.3g} rad: they are probably in degrees; convert them, or correct the limits"
+                f"'{bag}': the positions of joint '{joint}' are between {least:.3g} and {most:.3g}, and its limits"
+                f" {low:.3g} and {high:.3g} rad: they are probably in degrees; convert them, or correct the limits"
             )
     values = parameters.dynamics(parameters.start)
     stretch = max(fitted, key=lambda each: len(each.t))
@@ -194,33 +198,36 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
     model = Y[:, :, 0] + np.einsum("g,kgi->ki", values.gravity, G[:, :, :, 0])
     for joint, effort in zip(robot.joints, few.tau.T):
         if not effort.any():
-            raise InputError(f"the effort of joint '{joint}' is 0 throughout: it was not recorded")
+            raise InputError(f"'{bag}': the effort of joint '{joint}' is 0 throughout: it was not recorded")
     turning = ~np.array(robot.prismatic)
     own = zip(few.tau.T, G[:, :, :, 0].transpose(2, 0, 1), Y[:, :, 0].T, few.v.T, few.a.T)
-    scales = np.array([_gravity_of(*each) for each in own])[turning] / max(np.linalg.norm(values.gravity), 1e-300)
+    scales = np.array([_gravity_of(values.gravity, *each) for each in own])[turning]
+    scales /= np.linalg.norm(values.gravity) or np.nan
     theirs, ours = (np.sqrt(np.mean(each**2, axis=0))[turning] for each in (few.tau, model))
     usual = np.exp(np.median(np.log(scales[known]))) if (known := np.isfinite(scales)).any() else 1.0
     if not 1.0 / WRONG_UNITS < usual < WRONG_UNITS:
         raise InputError(
-            f"the recorded efforts are {usual:.2g} times those of the URDF's masses: they are probably not in N·m,"
-            " but for example in N·mm, a factor of 1000; convert them, or correct the masses"
+            f"'{bag}': the recorded efforts are {usual:.2g} times those of the URDF's masses: they are probably not in"
+            " N·m, but for example in N·mm, a factor of 1000; convert them, or correct the masses"
         )
     high = np.flatnonzero(scales > WRONG_UNITS).tolist()  # a payload can do so to a light wrist, but not to it alone
     if len(high) == 1 and theirs[high[0]] == max(theirs.max(), ours.max()):
         joint = np.array(robot.joints)[turning][high[0]]
         raise InputError(
-            f"the recorded efforts of joint '{joint}' are {scales[high[0]]:.2g} times those of the URDF's masses,"
-            " unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them, or correct the"
-            " masses"
+            f"'{bag}': the recorded efforts of joint '{joint}' are {scales[high[0]]:.2g} times those of the URDF's"
+            " masses, unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them, or correct"
+            " the masses"
         )
 
 
-def _gravity_of(tau: Array, loads: Array, inertia: Array, v: Array, a: Array) -> float:
+def _gravity_of(given: Array, tau: Array, loads: Array, inertia: Array, v: Array, a: Array) -> float:
     """Return the gravity that explains a joint's efforts beside inertia, friction, damping and armature, m/s².
 
     NaN if the data do not determine it, as for a joint without load. ``loads`` are efforts of gravity of 1 m/s² along
     each axis, N × 3.
     """
+    strength = np.abs(loads).max(axis=0)
+    loads = np.where(strength > LEAST_LOAD * strength.max(), loads, 0.0)
     columns = np.column_stack([loads, inertia, np.sign(v), v, a])
     size = np.linalg.norm(columns, axis=0)
     size[size == 0.0] = 1.0
@@ -228,9 +235,12 @@ def _gravity_of(tau: Array, loads: Array, inertia: Array, v: Array, a: Array) ->
     inverse = directions.T / np.where(strengths > SEPARATE * strengths[0], strengths, np.inf)
     noise = float(np.sum((tau - U @ (U.T @ tau)) ** 2)) / max(1, len(tau) - len(size))
     found, deviation = (inverse @ U.T @ tau / size)[:3], np.sqrt(noise * np.sum(inverse**2, axis=1))[:3] / size[:3]
+    gravity = float(np.linalg.norm(found))
     loaded = np.abs(loads).max() > SEPARATE * np.abs(tau).max()
-    sure = loaded and np.linalg.norm(found) > SURE * np.linalg.norm(deviation)
-    return float(np.linalg.norm(found)) if sure else np.nan
+    # a joint that the given gravity does not load cannot show that efforts are too small
+    free = np.abs(loads @ given).max() <= LEAST_LOAD * strength.max() * np.linalg.norm(given)
+    sure = loaded and gravity > SURE * np.linalg.norm(deviation) and not (free and gravity < np.linalg.norm(given))
+    return gravity if sure else np.nan
 
 
 def _result(
