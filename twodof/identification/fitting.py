@@ -215,8 +215,8 @@ def _check_units(parameters: Parameters, fitted: Sequence[Stretch], bag: str) ->
         joint = np.array(robot.joints)[turning][high[0]]
         raise InputError(
             f"'{bag}': the recorded efforts of joint '{joint}' are {scales[high[0]]:.2g} times those of the URDF's"
-            " masses, unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them, or correct"
-            " the masses"
+            " masses, unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them, or"
+            " correct the masses"
         )
 
 
