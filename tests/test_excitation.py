@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from bags import STORE
 from motions import assert_true, bag_of, follow, mujoco_model
+from rosbags.rosbag2 import Reader
 from scipy.interpolate import make_interp_spline
 from test_fit import ARM, FREE, GRAVITY, HIDDEN, JOINTS, TRUTH
 
 import twodof
+from twodof.bag.trajectory_bag import TOPIC
 from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.identification import excitation
@@ -101,6 +105,29 @@ def test_the_command_writes_inputs_of_a_run(tmp_path, capsys, monkeypatch):
     assert [p.after for p in fit.parameters] == pytest.approx([0.08, 0.05], rel=0.02)
 
 
+def test_a_bag_has_the_motion_as_a_trajectory_that_a_run_follows(tmp_path, monkeypatch, capsys):
+    """rosbags reads it by its own types."""
+    monkeypatch.setattr(excitation, "GENERATIONS", 1)
+    motion, words = twodof.excite(ARM, 5.0, "friction[*]", gravity=GRAVITY), ["--gravity", *map(str, GRAVITY)]
+    words = ["fit", str(ARM), "--design", "5", "--free", "friction[*]", *words, "-o", str(tmp_path / "excite")]
+    assert main(words) == 0
+    with Reader(tmp_path / "excite") as reader:
+        ((connection, _, data),) = reader.messages()
+        message: Any = STORE.deserialize_cdr(data, connection.msgtype)
+    assert (connection.topic, connection.msgtype) == (TOPIC, "trajectory_msgs/msg/JointTrajectory")
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    assert message.joint_names == [*JOINTS] and times == pytest.approx(motion.t[::5].tolist(), abs=1e-9)
+    for name, values in (("positions", motion.q), ("velocities", motion.v), ("accelerations", motion.a)):
+        np.testing.assert_array_equal([getattr(point, name) for point in message.points], values[::5])
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", twodof.FmuOptions(native=True, control="joint", q_start=(0.0, 0.0)))
+    command = ["run", str(fmu), "--input", str(tmp_path / "excite"), "--stop-time", "5", "--step", "0.002"]
+    assert main([*command, "-o", str(tmp_path / "bag")]) == 0
+    np.testing.assert_allclose(twodof.read_bag(tmp_path / "bag").q, motion.q, atol=1e-4)
+    capsys.readouterr()
+    assert main(words) == 1
+    assert "exists, and is not replaced" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -109,6 +136,7 @@ def test_the_command_writes_inputs_of_a_run(tmp_path, capsys, monkeypatch):
         (["bag", "--design", "20"], "and not both"),
         ([], "name bags of the robot, or a motion to record with --design S"),
         (["--design", "20", "-o", "missing/excite.csv"], "cannot write 'missing/excite.csv'"),
+        (["--design", "20", "-o", "missing/excite"], "cannot write 'missing/excite'"),
         (["--design", "20", "--gravity", "nan", "0", "0"], "is not three finite numbers"),
         (["--design", "20", "--gravity", "0", "-999", "0"], "does not hold the robot in the middle of its range"),
     ],

@@ -30,9 +30,9 @@ def add(fit: Parser) -> None:
         help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
         " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
     )
-    text = "without bags: write a motion of S seconds as a CSV, from whose recording a fit is most precise"
+    text = "without bags: write a motion of S seconds, from whose recording a fit is most precise"
     option("--design", type=float, metavar="S", help=text)
-    add_output(fit, "FOLDER|CSV", "folder of the fitted robot (fitted), or file of the motion (excite.csv)")
+    add_output(fit, "PATH", "folder of the fitted robot (fitted), or motion: a .csv file (excite.csv) or a bag")
     text = "link of the payload (the last link, if there is only one)"
     option("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
     text = "gravity, m/s2 in the root frame (the run's, else 0 0 -9.81)"

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.optimize import differential_evolution
 
+from ..bag.trajectory_bag import write_trajectory
 from ..errors import InputError
 from ..files import refusing, write_file
 from ..plant.robot import Robot
@@ -28,6 +29,7 @@ from ..plant.urdf import UNBOUNDED
 from ..signatures import with_keywords_of
 from .curves import efforts
 from .estimate import DELAY_SCALE, FIRST_NOISE, PRIOR, information_root, typical
+from .fit_result import check_folder
 from .fitting import GRAVITY, ModelOptions, read_model
 from .parameters import Parameters
 from .regression import Rows, position_derivatives, regressors
@@ -46,6 +48,7 @@ REACH, SPEED = np.pi, 2.0
 """Range to both sides, rad or m, and speed, rad/s or m/s, of joints that have no limits in the URDF."""
 COARSE, FINE = 0.1, 0.002
 """Time between samples of the design and of the result, s."""
+POINTS = 5  # samples from one point of a trajectory to the next, between which it is quintic
 CANDIDATES, GENERATIONS, BOUND = 30, 60, 6.0
 """Number of random motions from which the search begins, its steps, and the bound of its coefficients."""
 MOST_WORK = 4e9
@@ -72,17 +75,26 @@ class Excitation(NamedTuple):
     factor: float
 
     def save(self, path: str | Path) -> Path:
-        """Write the motion as a CSV file of inputs for joint control; return its path.
+        """Write the motion, and return its path: as inputs for joint control if it ends in .csv, else as a bag.
+
+        The bag has one JointTrajectory on the topic of ROS 2's joint_trajectory_controller.
 
         Raises:
-            InputError: the file cannot be written.
+            InputError: the file or folder cannot be written, or the folder exists.
         """
-        heads = [f"{group}[{i + 1}]" for group in ("q_des", "v_des", "a_des") for i in range(len(self.joints))]
-        rows = np.column_stack([self.t, self.q, self.v, self.a]).round(9).tolist()
-        lines = [",".join(["time", *heads]), *(",".join(map(repr, row)) for row in rows)]
+        path = Path(path)
         with refusing(InputError, f"write '{path}'"):
-            write_file(Path(path), ("\n".join(lines) + "\n").encode())
-        return Path(path)
+            if path.suffix == ".csv":
+                heads = [f"{group}[{i + 1}]" for group in ("q_des", "v_des", "a_des") for i in range(len(self.joints))]
+                rows = np.column_stack([self.t, self.q, self.v, self.a]).round(9).tolist()
+                lines = [",".join(["time", *heads]), *(",".join(map(repr, row)) for row in rows)]
+                write_file(path, ("\n".join(lines) + "\n").encode())
+            else:
+                few = slice(None, None, POINTS)
+                write_trajectory(
+                    check_folder(path), self.joints, *(each[few] for each in (self.t, self.q, self.v, self.a))
+                )
+        return path
 
 
 class _Design:
@@ -215,15 +227,17 @@ def excite(
     Args:
         urdf, free, frame, lock, gravity, progress: as for ``fit``; ``gravity`` None: (0, 0, −9.81).
         seconds: duration, s.
-        output: CSV file of the motion; None: nothing is written.
+        output: .csv file, or new folder of a bag, as for ``save``; None: nothing is written.
 
     Raises:
         InputError: the duration is out of range, a pattern matches no parameter, there are too many parameters, an
-            effort limit does not hold the robot, or the file cannot be written.
+            effort limit does not hold the robot, or the output cannot be written.
         BuildError: the URDF cannot be read.
     """
     if not SHORTEST <= seconds <= LONGEST:
         raise InputError(f"a motion of {seconds:g} s is not possible: between {SHORTEST:g} and {LONGEST:g} s")
+    if output is not None and Path(output).suffix != ".csv":
+        check_folder(output)
     model = read_model(urdf, free, **options)
     gravity = options.get("gravity")
     parameters, robot = model.parameters(GRAVITY if gravity is None else tuple(gravity)), model.robot
