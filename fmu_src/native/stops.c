@@ -81,7 +81,7 @@ INTERNAL double coarseness(const Plant *plant)
 /* Remove the velocity that points into a limit from the state y = (q, v). Joints in anti_chatter stop in both
    directions; without them, mutual impacts could repeat without end in finite time (Zeno), as those of the feet of a
    rocking block. Returns whether a velocity pointed into a limit. */
-static int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
+INTERNAL int impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
 {
     Contact contact[N_JOINTS];
     double impulse[N_JOINTS], *v = y + N_JOINTS;
