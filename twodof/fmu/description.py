@@ -7,7 +7,6 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -103,7 +102,7 @@ class Fmu:
         identifier = self.description.coSimulation.modelIdentifier
         return f"{identifier}{fmpy.sharedLibraryExtension}"
 
-    @cached_property
+    @property
     def urdf(self) -> str | None:
         """Text of resources/robot.urdf; None without it."""
         content = resource_reader(self)("robot.urdf")
