@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from harness import forged
+from harness import forged, python
 
 import twodof
 from twodof.cli.main import main
@@ -70,3 +70,31 @@ def test_a_page_of_a_frame_that_its_robot_has_not_is_refused(native_path, tmp_pa
     fmu = forged(native_path, tmp_path, 'frame="EndEffector"', 'frame="Nope"')
     with pytest.raises(PageError, match="its robot cannot be shown: it has no link 'Nope'"):
         twodof.page(fmu, tmp_path / "arm.html")
+
+
+def test_variables_of_one_enumeration_share_its_items(native_path, tmp_path):
+    """A copy of 10,000 items for each of 10,000 variables would take gigabytes."""
+    items = "".join(f'<Item name="i{i}" value="{i}"/>' for i in range(10_000))
+    types = rf'\g<0><SimpleType name="E"><Enumeration>{items}</Enumeration></SimpleType>'
+    kind = 'causality="parameter" variability="fixed"><Enumeration declaredType="E" start="1"/></ScalarVariable>'
+    variables = "".join(f'<ScalarVariable name="e{i}" valueReference="{10_000 + i}" {kind}' for i in range(10_000))
+    (tmp_path / "typed").mkdir()
+    typed = forged(native_path, tmp_path / "typed", "<TypeDefinitions>", types)
+    fmu = forged(typed, tmp_path, "</ModelVariables>", variables + r"\g<0>")
+    program = (
+        f"import re, twodof\nfmu = twodof.load_fmu({str(fmu)!r})\n"
+        "print(fmu.type_of('e9999').value('i7', 'e9999'))\n"
+        "print(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1])"
+    )
+    item, peak = python("-c", program, check=True).stdout.split()
+    assert item == "7" and int(peak) < 400_000  # KiB
+
+
+def test_a_long_start_value_is_cut_and_does_not_widen_the_table(native_path, tmp_path, capsys):
+    text = "<String start=" + '"' + "a" * 1_000_000 + '"/>'
+    named = '<ScalarVariable name="text" valueReference="9999" causality="parameter" variability="fixed">'
+    fmu = forged(native_path, tmp_path, "</ModelVariables>", f"{named}{text}</ScalarVariable></ModelVariables>")
+    assert main(["info", str(fmu)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(len(line) > 200 for line in lines) == 1 and max(map(len, lines)) < 1200
+    assert any("… (1000000 characters)" in line for line in lines)

@@ -28,6 +28,8 @@ NEEDS = {"plot": "matplotlib", "view": "websockets"}
 POSE = "control 'pose'"
 """An argument of the library that corresponds to two options."""
 
+LONGEST, WIDEST = 1000, 120
+"""Characters of a table's cell that are printed, and of a cell that widens its column."""
 MOMENT, TICK = 0.4, 0.5
 """Seconds of silence before a task is named, and between two updates of its time."""
 CLEAR = "\r\x1b[K"
@@ -59,11 +61,19 @@ def say(text: str = "", *, error: bool = False) -> None:
 
 
 def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = "") -> None:
-    """Print rows of texts in aligned columns, each line after a prefix; a line break in a text is an escape."""
-    cells = [[plain(text).replace("\n", "\\n") for text in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells)]
+    """Print rows of texts in aligned columns, each line after a prefix; a line break in a text is an escape.
+
+    A long text is cut, and does not widen the column of the others: a text of an untrusted file may have megabytes.
+    """
+    cells = [[_cell(text) for text in row] for row in rows]
+    widths = [max((len(text) for text in column if len(text) <= WIDEST), default=0) for column in zip(*cells)]
     for row in cells:
         say(before + "  ".join(map(align, row, widths)).rstrip())
+
+
+def _cell(text: str) -> str:
+    shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}… ({len(text)} characters)"
+    return plain(shown).replace("\n", "\\n")
 
 
 def written(path: Path, *facts: str) -> str:

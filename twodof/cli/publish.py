@@ -36,7 +36,7 @@ def add(publish: Parser) -> None:
     option("--rate", type=float, default=100.0, metavar="HZ", help="communication steps per second (%(default)g)")
     flag("--subnet", help="publish to other hosts too, not only to this one")
     flag("--foxglove", help="serve Foxglove too, on this machine only")
-    option("--foxglove-port", type=int, metavar="PORT", help="port for Foxglove (8765)")
+    option("--foxglove-port", "--port", type=int, metavar="PORT", help="port for Foxglove (8765)")
     flag("--foxglove-control", help="allow Foxglove to set the gains")
     add_options(publish, "--namespace")
     option("--state-topic", default="joint_states", metavar="TOPIC", help="topic of the joint states (%(default)s)")

@@ -175,7 +175,7 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     fmu = Fmu(
         path=path,
         description=description,
-        variables={scalar.name: scalar for variable in description.modelVariables for scalar in scalars(variable)},
+        variables=_variables(description),
         members=members,
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
         **_vendor_annotation(root),
@@ -188,6 +188,14 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
         except ValueError:
             raise FmuError(f"'{where}': start value of {name}, '{variable.start:.50}', is not a number") from None
     return fmu
+
+
+def _variables(description: ModelDescription) -> dict[str, Scalar]:
+    """Return the scalars of all variables by name."""
+    items = {type_.name: {item.name: int(item.value) for item in type_.items} for type_ in description.typeDefinitions}
+    items[None] = {}
+    declared = ((v, v.declaredType.name if v.declaredType else None) for v in description.modelVariables)
+    return {scalar.name: scalar for variable, name in declared for scalar in scalars(variable, items[name])}
 
 
 def problems_of(path: Path, inside: str = "") -> list[str]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import product
 from math import inf, prod
 
@@ -29,7 +29,7 @@ class Scalar:
         relative: whether it is a difference of values, to which the offset of a unit does not apply.
         element: 0-based index in the array, row by row.
         low, high: texts of the range; None without one.
-        items: names and numbers of the items of an enumeration.
+        items: numbers of the items of an enumeration by name; scalars of one type share it.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Scalar:
     element: int = 0
     low: str | None = None
     high: str | None = None
-    items: tuple[tuple[str, int], ...] = ()
+    items: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def start_value(self) -> float | bool | None:
@@ -65,14 +65,13 @@ class Scalar:
             return Type(self.type)
         read = int if self.type in WHOLE else float
         low, high = (end if text is None else read(text) for text, end in ((self.low, -inf), (self.high, inf)))
-        return Type(self.type, low, high, dict(self.items))
+        return Type(self.type, low, high, self.items)
 
 
-def scalars(variable: ModelVariable) -> Iterator[Scalar]:
-    """Yield a scalar variable itself, or the elements of an array."""
+def scalars(variable: ModelVariable, items: Mapping[str, int]) -> Iterator[Scalar]:
+    """Yield a scalar variable itself, or the elements of an array, with the items of its enumeration."""
     kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
     kind += "[]" if kind == "String" and variable.dimensions else ""
-    items = [] if variable.declaredType is None else variable.declaredType.items
     whole = Scalar(
         name=variable.name,
         causality=variable.causality,
@@ -85,7 +84,7 @@ def scalars(variable: ModelVariable) -> Iterator[Scalar]:
         relative=bool(variable.relativeQuantity),
         low=variable.min,
         high=variable.max,
-        items=tuple((item.name, int(item.value)) for item in items),
+        items=items,
     )
     if not variable.dimensions:
         yield whole

@@ -54,7 +54,7 @@ class Trial:
         length = inf if stop is None else (float(stop) - self.start) / self.step
         self.steps = int(max(2.0, min(STEPS, length + 1e-6)))
         self.variables: dict[str, ModelVariable] = {
-            scalar.name: v for v in self.about.modelVariables for scalar in scalars(v) if scalar.type == "Real"
+            scalar.name: v for v in self.about.modelVariables for scalar in scalars(v, {}) if scalar.type == "Real"
         }
         self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
         self.others = [
