@@ -7,22 +7,21 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import islice
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..errors import SimulationError, diverged, step_failure
+from ..errors import SimulationError
 from ..files import temporary_folder
 from ..fmu import Instance, SystemInstance, instantiate
+from ..signatures import ignore, never
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import resolve
-from ..simulation.judge import OUTPUTS, Judge
+from ..simulation.judge import Judge
 from ..simulation.master import simulate
-from ..simulation.setup import Array, robot_of
-from ..simulation.stepping import judge_of
+from ..simulation.setup import robot_of
+from ..simulation.stepping import judge_of, stepped
 from ..simulation.verdict import METRICS
 
 Point = tuple[int, tuple[float, ...]]
@@ -112,8 +111,7 @@ class Runner:
             bag = Bag(self._job.bags / f"{number:06d}", overwrite=True)
             return simulate(run, bag, instance=self._fresh()).judge
         judge = judge_of(run, self._robot)
-        rows = trace(run, self._fresh())
-        judge.judge(np.arange(len(rows), dtype=np.float64) * run.step, rows, judge.targets)
+        deque(stepped(run, judge, None, never, ignore, ignore, self._fresh(), ()), maxlen=0)  # makes no samples
         return judge
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
@@ -138,34 +136,6 @@ def lost(point: Point, end: float, outcome: str, message: str) -> Row:
     """Return the row of a run that was not finished."""
     number, values = point
     return (number, *values, *[nan] * len(METRICS), end, outcome, message)
-
-
-def trace(run: Experiment, instance: Instance | SystemInstance) -> Array:
-    """Return the outputs q, v, x, tau and quat side by side at all samples of a run without changes, N + 1 × values.
-
-    It makes no ``Sample`` objects, to save time. Errors are those of ``samples``.
-    """
-    instance.initialise(run.start_time, run.time(run.steps), {**run.given, **run.texts})
-    names = [*chain(*map(run.fmu.vector, OUTPUTS))]
-    rows, read, step = bytearray(), instance.reader(names), instance.step
-    start, h = run.start_time, run.step
-    rows += read()
-    try:
-        for k in range(int(run.steps)):
-            step(start + k * h, h)
-            rows += read()
-    except SimulationError as error:
-        _finite(run, rows, len(names))
-        raise step_failure(k, run.time(k), error) from error
-    return _finite(run, rows, len(names))
-
-
-def _finite(run: Experiment, rows: bytearray, width: int) -> Array:
-    table = np.asfortranarray(np.frombuffer(rows, np.float64).reshape(-1, width))  # fast along time
-    if np.isfinite(table).all():
-        return table
-    astray = np.flatnonzero(~np.isfinite(table).all(axis=1))
-    raise diverged(int(astray[0]), run.time(int(astray[0])))
 
 
 class Batches:
