@@ -283,6 +283,8 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         stamps[1500:] -= 403_000_000
     elif change == "no efforts":
         effort = None
+    elif change == "bursts":  # of 50 samples within 49 ns
+        stamps = 10**18 + np.arange(len(q)) + 34_000_000 * (np.arange(len(q)) // 50)
     elif change == "slow":
         stamps = 10**18 + 52_000_000 * np.arange(len(q))
     return q, effort, stamps, names
@@ -305,6 +307,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("repeated", "several joint states at one time"),
         ("set back", "was the clock set back"),
         ("no efforts", "has no efforts"),
+        ("bursts", "are uneven: half of the joint states are at most 1e-09 s after the one before"),
         ("slow", "has 19.2 joint states a second; a fit needs 20"),
     ],
 )

@@ -33,6 +33,7 @@ CUTOFF, ORDER = 2.5, 5
 GAP, FINE = 3.5, 0.01
 """Multiple of the usual time between samples that counts as a gap, and the least usual time that counts for it, s."""
 SHORTEST = 2.0  # s: shortest stretch between gaps
+UNEVEN = 5.0  # largest ratio of the mean time between samples to the usual one
 EDGE = 0.15  # s at both ends of a stretch that are not used, because the filter has samples on one side only
 HELD_OUT = 0.2  # fraction of each recording, at its end
 MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
@@ -118,6 +119,12 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
         whole = [(a, b) for a, b in pairwise(cuts) if t[b - 1] - t[a] >= SHORTEST]
         if not whole:
             raise InputError(f"'{name}' is too short: a fit needs {SHORTEST:g} s without a gap")
+        apart = max((t[b - 1] - t[a]) / (b - a - 1) for a, b in whole)
+        if apart > UNEVEN * h:
+            raise InputError(
+                f"the time stamps in '{name}' are uneven: half of the joint states are at most {h:.3g} s after the"
+                f" one before, and the mean is {apart:.3g} s; record joint states at an even rate"
+            )
         end, many = t[-1] * (1.0 - HELD_OUT), max(1, int(1.0 / (MOST_RATE * h) + 1e-6))
         for a, b in whole:
             stretch = _smooth(bag, _means(t[a:b], many), _means(q[a:b], many), _means(tau[a:b], many), many * h)
