@@ -53,7 +53,7 @@ LIBRARIES = {
     "pandas": {"sweeps", "bag", "plots", "pages", "cli"},  # tables: made, of a recording, drawn, shown, printed
     "pinocchio": {"plant", "identification"},  # its regressors
     "plotly": {"plots"},
-    "pyarrow": {"sweeps"},
+    "pyarrow": {"sweeps", "bag"},
     "pytest": {"testing"},
     "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
     "rosbags": {"ros", "bag"},

@@ -173,3 +173,17 @@ def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path, tmp_p
         assert twodof.recover(bags[1]).original is None
     with pytest.raises(twodof.TwoDofError, match="`compress` applies to storage mcap only"):
         twodof.Bag(tmp_path / "new", storage="sqlite3", compress="zstd")
+
+
+def test_a_dataset_has_no_objects_for_each_sample(tmp_path):
+    samples = 20_000
+    states = (
+        ("/joint_states", 10_000_000 * k, joint_message(10_000_000 * k, ["a"], [0.1 * k], [1.0], [2.0]))
+        for k in range(samples)
+    )
+    bag = write_third_party(tmp_path / "bag", states, storage_plugin=StoragePlugin.MCAP)
+    tracemalloc.start()
+    twodof.export_bag(bag, tmp_path / "out.lerobot")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 400 * samples  # a NumPy array in an object column takes a kilobyte

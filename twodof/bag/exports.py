@@ -48,7 +48,7 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     if path.resolve().parent in [each.resolve() for each in bags]:
         raise BagError(f"'{path}' is in the bag, whose files are not replaced; give another `output`")
     if path.suffix == ".lerobot":
-        write_dataset([*map(read_bag, bags)], path)
+        write_dataset(bags, path)
         return path
     if len(bags) > 1:
         raise BagError(f"'{path}' has one bag; several become the episodes of a folder that ends in .lerobot")

@@ -100,17 +100,17 @@ def _frames(track: Track, times: Array) -> Iterator[bytes]:
     figure = drawn(Drawing(title([track]), track.name, partial(_draw, track), ()))
     figure.set_dpi(DOTS)
     canvas = FigureCanvasAgg(figure)
-    arms = [(axes, axes.lines[-1]) for axes in figure.axes]
+    arms = [axes.lines[-1] for axes in figure.axes]
     clock = figure.text(0.99, 0.02, "", ha="right", color=GREY, animated=True)
     canvas.draw()
     still, points = canvas.copy_from_bbox(figure.bbox), track.skeletons(times)
-    planes = [["xyz".index(letter) for letter in str(axes.get_label())] for axes, _ in arms]
+    planes = [["xyz".index(letter) for letter in str(axes.get_label())] for axes in figure.axes]
     for t, arm in zip(times, points):
         canvas.restore_region(still)
         clock.set_text(f"{t:.2f} s of {number(float(track.t[-1]))} s")
-        for (axes, line), plane in zip(arms, planes):
+        for line, plane in zip(arms, planes):
             line.set_data(*arm[:, plane].T)
-            axes.draw_artist(line)
+            figure.draw_artist(line)
         figure.draw_artist(clock)
         yield bytes(canvas.buffer_rgba())
 
