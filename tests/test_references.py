@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from unittest.mock import Mock
 
 import fmpy
 import lxml.etree
@@ -25,6 +26,7 @@ from twodof.fmu import checking
 from twodof.fmu.description import load_any_fmu
 from twodof.fmu.importers import in_this_master
 from twodof.fmu.reference_runs import Reference, references_of
+from twodof.fmu.wiring import units_of
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
 MANIFEST = f"{FOLDER}fmi-ls-manifest.xml"
@@ -285,6 +287,7 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
         ("references.exp", b'stepSize="0.01"', b'stepSize="0"', "must be a run of at most"),
         ("push-ref.csv", b"time,", b"x" * 200_000 + b",", "field larger than field limit"),
         ("references.exp", b'name="push"', b'name="move"', "two experiments have one name"),
+        ("references.exp", b'name="push"', b'name="' + b"p" * 1001 + b'"', "a name of more than 1000 characters"),
         ("push-in.csv", b"tau_ext[1]", b"tau_axt[1]", "there is no variable 'tau_axt[1]'"),
     ],
 )
@@ -296,6 +299,13 @@ def test_damaged_references_fail_their_row(
     files[FOLDER + name] = files[FOLDER + name].replace(old, new)
     found = rows(packed(files, tmp_path / "damaged.fmu"))
     assert any(row.outcome == "failed" and text in row.text for row in found.values()), found
+
+
+def test_the_units_of_an_fmu_are_read_once(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = Mock(side_effect=units_of)
+    monkeypatch.setattr("twodof.fmu.reference_runs.units_of", read)
+    found = references_of(load_any_fmu(built))
+    assert sum(len(reference.parameters) for reference in found) > 1 and read.call_count == 1
 
 
 def test_the_cells_of_all_tables_are_limited(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_CELLS, MAX_REFERENCES
+from ..bounds import MAX_CELLS, MAX_NAME, MAX_REFERENCES
 from ..errors import FmuError, SimulationError
 from ..export.typed_values import WHOLE
 from ..files import read_member
@@ -156,7 +156,7 @@ class _Files:
 
     def __init__(self, fmu: Fmu, archive: zipfile.ZipFile) -> None:
         self._fmu, self._archive, self._folder = fmu, archive, posixpath.dirname(MANIFEST)
-        self._room, self._cells, self._steps = MAX_REFERENCES, MAX_CELLS, MOST_STEPS
+        self._room, self._cells, self._steps, self._units = MAX_REFERENCES, MAX_CELLS, MOST_STEPS, units_of(fmu)
         self.digests: dict[str, str] = {}
 
     def read(self, source: str) -> bytes:
@@ -182,13 +182,15 @@ class _Files:
         if results is None or results.get("type", "text/csv") != "text/csv" or "stepSize" not in times:
             return None
         start, stop, step = (float(times.get(f"{key}", 0.0)) for key in ("startTime", "stopTime", "stepSize"))
-        count = (stop - start) / step if step > 0.0 else 0.0
+        count, name = (stop - start) / step if step > 0.0 else 0.0, experiment.get("name", "")
+        if len(name) > MAX_NAME:
+            raise ValueError(f"an experiment has a name of more than {MAX_NAME} characters: '{name:.50}'…")
         if not 0.5 < count < self._steps:
             most = f"at most {MOST_STEPS} whole steps, together with those before it"
-            raise ValueError(f"experiment '{experiment.get('name')}' must be a run of {most}")
+            raise ValueError(f"experiment '{name:.50}' must be a run of {most}")
         self._steps -= round(count)
         return Reference(
-            *(experiment.get("name", ""), start, stop, step, float(times.get("tolerance", "nan"))),
+            *(name, start, stop, step, float(times.get("tolerance", "nan"))),
             parameters={} if parameters is None else self.parameters(parameters.get("source", "")),
             stimuli=([], np.zeros((1, 1))) if stimuli is None else self.stimuli(stimuli.get("source", "")),
             results=self.table(results.get("source", "")),
@@ -216,7 +218,7 @@ class _Files:
         """Return a value of a parameter set in the unit of its variable."""
         if (variable := self._fmu.variables.get(name)) is None:
             return value
-        own = units_of(self._fmu).get(variable.unit or "", Unit(variable.unit or ""))
+        own = self._units.get(variable.unit or "", Unit(variable.unit or ""))
         if variable.relative:
             own, unit = own.of_differences, unit.of_differences
         return conversion(f"{self._fmu.path}/{source}", unit, own, f"'{name}' and its value").of(value)

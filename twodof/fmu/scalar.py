@@ -44,7 +44,7 @@ class Scalar:
     element: int = 0
     low: str | None = None
     high: str | None = None
-    items: Mapping[str, int] = field(default_factory=dict)
+    items: Mapping[str, int] = field(default_factory=dict, hash=False)
 
     @property
     def start_value(self) -> float | bool | None:
