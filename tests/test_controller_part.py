@@ -197,7 +197,7 @@ def test_in_one_solver_a_split_loop_is_the_whole(fmus: dict[str, Path], tmp_path
 
 def test_a_controller_is_native_and_has_a_law(tmp_path: Path) -> None:
     for options in ({"control": "effort", "native": True}, {"control": "task"}):
-        with pytest.raises(BuildError, match="the controller alone is native"):
+        with pytest.raises(BuildError, match="the controller alone must be native"):
             twodof.FmuOptions(part="controller", **options)
     with pytest.raises(BuildError, match="`part` 'law' is unknown"):
         twodof.FmuOptions(part="law")

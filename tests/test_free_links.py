@@ -299,7 +299,7 @@ def test_a_start_value_of_the_build_is_that_of_a_run(tmp_path: Path) -> None:
         ({"mass_link2": 0.0}, "mass_link2 = 0 must be > 0"),
         ({"com_link2": (1.0, 2.0)}, "com_link2 has 3 elements, 2 were given"),
         ({"mass_link1": 0.5}, "there is no variable 'mass_link1'; did you mean 'mass_link2'?"),
-        ({"com_link2[2]": 0.1}, "references have the URDF's links; leave out `reference` or com_link2[2]"),
+        ({"com_link2[2]": 0.1}, "references are computed with the URDF's links; leave out `reference` or com_link2[2]"),
     ],
 )
 def test_an_impossible_start_value_of_a_link_is_refused(tmp_path: Path, settings: Any, message: str) -> None:

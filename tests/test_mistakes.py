@@ -60,11 +60,11 @@ MISTAKES: dict[str, str] = {
     f"{RUN} --cost settling": "no option '--cost'; did you mean '--fail-if'",
     f"{RUN} --fail-if overshoot>5%": "'overshoot>5%' is not a comparison, as 'error > 1e-3'; leave units out",
     f"{RUN} --fail-if error>1mm": "'error>1mm' is not a comparison, as 'error > 1e-3'; leave units out",
-    f"{RUN} --robot panda": "'arm.fmu' is an FMU and no system, of which --robot 'panda' would be .*; leave it out",
+    f"{RUN} --robot panda": "'arm.fmu' is an FMU, which has no components; leave out --robot 'panda'",
     "run --robot panda": "names a component of a system; .* build a robot with 'twodof build --robot panda'",
     "build robot.urdf --fmi 3.0": "'3.0' is not a whole number",
     "build --split -o arms.fmu": "'arms.fmu': the name of a system of FMUs ends in .ssp",
-    "info bag --cost settling": "--cost ranks the runs of a sweep, and 'bag' is none; leave it out",
+    "info bag --cost settling": "--cost ranks the runs of a sweep, and 'bag' is not a sweep; leave it out",
     "fit bag robot.urdf --free payload": "the URDF comes first: twodof fit robot.urdf bag",
     # paths
     "run bag": "'bag' is not an FMU: it is a bag; 'twodof view bag' takes it",

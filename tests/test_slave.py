@@ -391,7 +391,7 @@ def test_log_messages_are_no_printf_formats(tmp_path):
     assert "joint '100%s%n' is outside its limits" in driver.log[-1][1]
 
 
-# --- what this flavour cannot do ---
+# --- the limits of this flavour ---
 
 
 def refuse_a_call(fmu):
@@ -470,7 +470,7 @@ def test_the_limits_of_this_flavour_are_listed_row_by_row(fmu_path, native_path)
     for fmu in (fmu_path, native_path):
         with zipfile.ZipFile(fmu) as archive:
             page = archive.read("documentation/index.html").decode()
-        section = page.partition("<h2>What this flavour cannot do</h2>")[2].partition("<h2>")[0]
+        section = page.partition("<h2>Limits of this flavour</h2>")[2].partition("<h2>")[0]
         rows.append(re.findall("<tr><td>(.*?)</td>", section, re.DOTALL))
     python, native = rows
     assert native == []

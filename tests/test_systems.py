@@ -751,7 +751,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     ring = connection("a.y", "b.x") + connection("b.y", "a.x") + WIRES
     ring = ring.replace(connection("plant.q[1]", "pd.q[1]"), connection("a.y", "pd.q[1]"))
     parts = BOTH.replace("</ssd:Elements>", circle + "</ssd:Elements>")
-    yield "circle", ssd(f"{parts}<ssd:Connections>{ring}</ssd:Connections>"), {}, "circle of systems"
+    yield "circle", ssd(f"{parts}<ssd:Connections>{ring}</ssd:Connections>"), {}, "cycle of systems"
     ends = [*range(120)]
     through = connectors({f"x{k}": "input" for k in ends} | {f"y{k}": "output" for k in ends})
     within = "".join(connection(f"x{k}", f"y{k}") for k in ends)

@@ -139,7 +139,7 @@ class Child(Connection):
             timer.cancel()
 
     def _end(self) -> str:
-        """Return a text that says how the process ended."""
+        """Return in words how the process ended."""
         status = self._process.wait()
         return f"exit status {status}" if status >= 0 else str(strsignal(-status))
 

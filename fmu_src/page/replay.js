@@ -58,7 +58,7 @@ export class Replay extends Samples {
 
   /** @param {string} name */
   set(name) {
-    throw new Error(`${name} is what it was: this is a replay`);
+    throw new Error(`${name} cannot be set: this is a replay`);
   }
 
   /** @returns {[string, string][]} */

@@ -51,7 +51,7 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
         write_dataset(bags, path)
         return path
     if len(bags) > 1:
-        raise BagError(f"'{path}' has one bag; several become the episodes of a folder that ends in .lerobot")
+        raise BagError(f"'{path}' holds one bag; several become the episodes of a folder that ends in .lerobot")
     if path.suffix == ".mcap":
         content: Iterable[bytes] = _mcap(bags[0])
     else:

@@ -126,7 +126,7 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
 
 
 def _turns(every: NDArray[np.uint8], turn: Sequence[int], length: int) -> Rows:
-    """Return periodic records as rows; a period has this length, and its records begin at the offsets of the turn."""
+    """Return periodic records, one row for each period of a length; ``turn`` has the records' offsets in a period."""
     rows = every[: len(every) // length * length].reshape(-1, length)
     heads = np.concatenate([np.arange(offset, offset + HEAD.size + 2) for offset in turn])
     count, ahead = 1, 16

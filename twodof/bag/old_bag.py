@@ -68,7 +68,7 @@ def check_free(path: Path, *, overwrite: bool) -> None:
 
 
 def _hold(path: Path, overwrite: bool) -> int | None:
-    """Lock a bag that may be overwritten; return the lock's descriptor, or None if there is nothing."""
+    """Lock a bag that may be overwritten; return the lock's descriptor, or None if the path is free."""
     try:
         if not path.exists():
             return None

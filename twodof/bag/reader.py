@@ -152,7 +152,7 @@ class _Robot:
     def _made(self) -> Recording:
         count = self.counts[self._chosen, JOINT_STATE]
         if not count:
-            where = f" of the robot that its {file_of(self._namespace)} is of" if self._namespace else ""
+            where = f" of the robot of its {file_of(self._namespace)}" if self._namespace else ""
             raise BagError(f"'{self.path}' has no joint states{where}, no messages of type {JOINT_STATE}")
         stamps, q, v, tau = self.states.arrays()
         return Recording(
@@ -238,7 +238,7 @@ def verdict(run: Recording | str | Path | Iterable[Sample], experiment: Experime
     if isinstance(run, Recording | str | Path):
         return (run if isinstance(run, Recording) else read_bag(run)).verdict
     if experiment is None:
-        raise InputError("samples are judged with their `experiment`")
+        raise InputError("give the `experiment` of the samples, with which they are judged")
     judge, inputs = judge_of(experiment, robot_of(experiment.fmu.urdf)), None
     for k, sample in enumerate(run):
         if inputs is not None and sample.inputs is not inputs:

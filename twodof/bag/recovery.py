@@ -211,7 +211,7 @@ def _provenances(folder: Path, robots: Iterable[str], damage: list[str]) -> dict
         with suppress(OSError):
             content = read_file(folder / name, MAX_PROVENANCE, follow=False)
             if sum(map(len, kept.values())) + len(content) > MAX_PROVENANCES:
-                damage.append(f"'{name}', with which all of its kind have more than {MAX_PROVENANCES // MIB} MiB")
+                damage.append(f"'{name}', because files of its kind have more than {MAX_PROVENANCES // MIB} MiB")
             else:
                 kept[name] = content
     return kept

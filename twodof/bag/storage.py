@@ -260,7 +260,7 @@ class BagWriter(Writer):
 def yaml_text(value: object, indent: str = "") -> str:
     """Return the YAML of dicts with sorted keys, lists, whole numbers, texts and None, in blocks of lines.
 
-    Texts are in ASCII between double quotes, as in JSON, and so are keys that are not names.
+    Texts, and keys that are not names, are in ASCII between double quotes, as in JSON.
     """
     if isinstance(value, dict):
         keys = {key: key if PLAIN.fullmatch(key) else _quoted(key) for key in sorted(value)}
@@ -273,7 +273,7 @@ def yaml_text(value: object, indent: str = "") -> str:
 
 
 def _inside(value: object, indent: str) -> str:
-    """Return the YAML of a value behind its key."""
+    """Return the YAML of a value, as it follows its key."""
     if isinstance(value, dict):
         return "\n" + yaml_text(value, f"{indent}  ")
     return ("\n" if isinstance(value, list) and value else " ") + yaml_text(value, indent)

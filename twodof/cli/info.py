@@ -39,7 +39,7 @@ def call(options: argparse.Namespace) -> int:
         raise InputError(f"there is no '{path}'; did you mean '{near}'?")
     is_sweep = path.is_dir() and any(path.glob("*.parquet"))
     if options.cost and not is_sweep:
-        raise CommandLineError(f"--cost ranks the runs of a sweep, and '{path}' is none; leave it out")
+        raise CommandLineError(f"--cost ranks the runs of a sweep, and '{path}' is not a sweep; leave it out")
     if is_sweep:
         from ..sweeps.ranking import cost_of
         from ..sweeps.results import read_sweep

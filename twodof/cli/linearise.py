@@ -18,7 +18,7 @@ def add(linearise: Parser) -> None:
     linearise.add_repeatable(
         "--at",
         metavar="NAME=VALUE",
-        help="operating point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
+        help="operating point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, such as"
         " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
         completer=variables,
     )

@@ -13,7 +13,7 @@ from .view import address, open_page
 def add(live: Parser) -> None:
     live.description = "Step an FMU in real time behind a page in the browser: drag the target."
     add_fmu(live, "the default arm's", "FMU")
-    add_output(live, "BAG", "name of recordings")
+    add_output(live, "BAG", "name of the recorded bags")
     add_options(live, "--step", "--set", *OF_A_PAGE)
 
 

@@ -130,7 +130,7 @@ def _robot(options: FmuOptions, urdf: str) -> Robot:
         logger.warning("%s: %s", options.urdf, warning)
     if options.control == "pose" and sum(robot.moves_frame()) < len(axes) + 3:
         logger.warning(
-            "%d joints move '%s': not every position and orientation of it can be reached together",
+            "only %d joints move '%s': it cannot reach every position in every orientation",
             sum(robot.moves_frame()),
             robot.frame,
         )
@@ -172,7 +172,7 @@ def _model(options: FmuOptions, robot: Robot, links: Sequence[Variable]) -> tupl
         if refusal := next(filter(None, (v.refusal(v.start) for v in (*table, *links) if v.start is not None)), ""):
             raise ParameterError(refusal)
         if options.reference and (changed := next((v.name for v in links if v.start != v.known), "")):
-            raise ParameterError(f"references have the URDF's links; leave out `reference` or {changed}")
+            raise ParameterError(f"references are computed with the URDF's links; leave out `reference` or {changed}")
         Plant(robot, table, options.control).initialise()
     except (InputError, ParameterError) as error:
         raise BuildError(str(error)) from error

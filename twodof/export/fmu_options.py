@@ -99,11 +99,11 @@ class FmuOptions:
         if self.part == "controller" and self.outputs:
             raise BuildError("M, h, J and drift are outputs of the plant, which the controller alone does not have")
         if self.part == "split" and self.control == "effort":
-            raise BuildError("a split robot has a control law other than 'effort', which is the plant alone")
+            raise BuildError("a split robot needs a control law other than 'effort', which is the plant alone")
         if self.part != "all" and self.reference:
-            raise BuildError("reference trajectories are of the robot under its control law; leave out `reference`")
+            raise BuildError("reference trajectories need the whole robot under its control law; leave out `reference`")
         if self.part == "controller" and (not self.native or self.control == "effort"):
-            raise BuildError("the controller alone is native, `native=True`, and has a control law other than 'effort'")
+            raise BuildError("the controller alone must be native, `native=True`, with a control law other than 'effort'")
 
         if self.clocked and (self.part != "controller" or self.fmi != 3):
             raise BuildError("`clocked` goes with `part` controller and `fmi` 3")

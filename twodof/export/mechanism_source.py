@@ -128,7 +128,7 @@ def _joint_motion(robot: JointTree, motions: Sequence[Array]) -> dict[str, Value
 
 
 def _before(robot: JointTree, rows: Array, root: Array) -> list[Array]:
-    """Return the row before each joint, from those of the joints and the root."""
+    """Return for each joint the row of its parent, which is a joint or the root."""
     return [rows[parent] if parent >= 0 else root for parent in robot.parent]
 
 

@@ -100,7 +100,7 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
     if any(os.path.lexists(candidate) for candidate in candidates):
         where = " or ".join(f"'{root}'" for root in dict.fromkeys(folders))
         raise BuildError(
-            f"mesh '{uri}' not found in {where}, and it may come from nowhere else; give the folder"
+            f"mesh '{uri}' not found in {where}, and no other folder may be read; give the folder"
             " of the meshes, or of their packages, with `mesh_dir`"
         )
     raise FileNotFoundError

@@ -48,7 +48,7 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
         except (EOFError, ChildError) as error:
             raise BuildError(f"cannot expand '{path}': {error}") from error
     if remarks:
-        LOG.warning("%s: xacro says: %s", path, " ".join(remarks.split()))
+        LOG.warning("%s: xacro reports: %s", path, " ".join(remarks.split()))
     return str(text)
 
 

@@ -275,7 +275,7 @@ class Instance:
         return SimulationError(self._said or reason, outcome=outcome)
 
     def failure_in_c(self, status: int) -> SimulationError:
-        """Return the error of a status of a prepared call; earlier messages are not of this call."""
+        """Return the error of a status of a prepared call, without messages of earlier calls."""
         self._said = self._said if self._heard else ""
         return self.failure(status)
 

@@ -143,7 +143,7 @@ def references_of(fmu: Fmu) -> list[Reference]:
             raise FmuError(f"the references in '{fmu.path}' cannot be read: {error}") from error
     kept = [reference for reference in found if reference is not None]
     if len({reference.name for reference in kept}) < len(kept):
-        raise FmuError(f"the references in '{fmu.path}' cannot be told apart: two experiments have one name")
+        raise FmuError(f"two experiments of the references in '{fmu.path}' have the same name")
     return kept
 
 

@@ -1,6 +1,6 @@
 """Steps of FMUs in spans, in one call if one of their libraries has `twodof_span`, as native FMUs of this package.
 
-A call from Python takes longer than it takes a small robot's FMU. Spans are short, so that signals are handled.
+A call from Python takes longer than a step of a small robot's FMU. Spans are short, so that signals are handled.
 """
 
 from __future__ import annotations

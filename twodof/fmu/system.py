@@ -101,7 +101,7 @@ def load_fmu(path: str | Path, robot: str = "") -> Fmu:
         return load_system(path, robot)
     if robot:
         raise FmuError(
-            f"'{path}' is an FMU and no system, of which `robot` '{robot}' would be a component; leave it out"
+            f"'{path}' is an FMU, which has no components; leave out `robot` '{robot}'"
         )
     return logged(load_any_fmu(path))
 

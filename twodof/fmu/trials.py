@@ -102,7 +102,7 @@ def two_instances(trial: Trial) -> str:
 
 
 def _other_values(trial: Trial, instance: Instance) -> Values:
-    """Return other values of inputs, of real parameters, and of integers and Booleans, of each if the FMU runs so."""
+    """Return other values of inputs, real parameters and discrete variables; of each kind only if the FMU runs so."""
     values: Values = {}
     for change in (trial.changed_inputs(), trial.changed_parameters(), trial.changed_discrete()):
         with suppress(SimulationError):
@@ -227,7 +227,7 @@ def _stated(unknowns: Sequence[Unknown]) -> dict[int, set[int]]:
 def _compare_dependencies(
     trial: Trial, name: str, before: Sequence[float], after: Sequence[float], stated: Mapping[int, set[int]], kind: str
 ) -> None:
-    """Raise for an output that changed with an input on which it does not depend, by its unknown of a kind."""
+    """Raise for an output that changed with an input that its unknown of a ``kind`` does not declare."""
     own = trial.variables[name].valueReference
     for output, old, new in zip(trial.outputs, before, after):
         if old != new and own not in stated.get(trial.variables[output].valueReference, {own}):

@@ -150,7 +150,7 @@ class Wiring:
             way = [target]
             while way[-1] in self._incoming:
                 if len(way) > MAX_COMPONENTS:
-                    what = f"a circle of systems, or longer than {MAX_COMPONENTS}"
+                    what = f"a cycle of systems, or longer than {MAX_COMPONENTS}"
                     raise FmuError(f"'{self._path}': the connections to '{target}' are {what}")
                 way.append(self._incoming[way[-1]][0])
                 if way[-1].element in self._fmus:

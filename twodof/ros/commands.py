@@ -29,7 +29,7 @@ def warner(log: logging.Logger) -> Callable[[str, str], None]:
     def warn(kind: str, text: str) -> None:
         if kind not in warned:
             warned.add(kind)
-            log.warning("%s; there may be more like it", text)
+            log.warning("%s; further messages of this kind are not reported", text)
 
     return warn
 
