@@ -260,8 +260,8 @@ def test_states_of_instances_with_and_without_a_clock_are_apart(events: Any, law
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"fmi": 3}, "`clocked` goes with `part` controller and `fmi` 3"),
-        ({"part": "controller"}, "`clocked` goes with `part` controller and `fmi` 3"),
+        ({"fmi": 3}, "`clocked` needs `part` controller and `fmi` 3"),
+        ({"part": "controller"}, "`clocked` needs `part` controller and `fmi` 3"),
         ({"part": "controller", "fmi": 3}, "the clock needs the controller's period; set control_period"),
     ],
 )

@@ -59,7 +59,7 @@ static int mended(const Contact *contact, double acts, double rate, double slack
    only if z is at its lower bound, and below 0 only if z is at its upper bound. Each iteration changes all violated
    contacts (block pivoting). If their number does not decrease for some iterations, only the last one changes, which
    terminates for every positive definite M. A bound is exceeded if z is beyond it by more than the rounding error of
-   the largest effort or impulse, of z and of those that act besides. Returns whether a solution was found, with the
+   the largest effort or impulse, which is in z or is `acting`. Returns whether a solution was found, with the
    rates and z.
    Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974. */
 static int complementary(const Plant *plant, const double q[N_JOINTS], Contact contact[N_JOINTS], double acting,

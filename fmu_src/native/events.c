@@ -1,8 +1,8 @@
 /* State events of joint stops, of friction and of J⁺. The indicator of a limit is the distance of the joint from a
    position just past the limit, or, for a joint at rest there, the effort that presses it against the limit. The
    indicator of friction is the velocity in the direction of slip, or, for a joint that sticks, the distance of the
-   holding effort from its bounds. That of a joint without friction is the friction itself, where it is an input and may
-   rise. Offsets keep each indicator away from zero after its event. */
+   holding effort from its bounds. If the friction of a joint is 0 and an input, the indicator is
+   the friction itself, which may rise. Offsets keep each indicator away from zero after its event. */
 #include <float.h>
 #include <math.h>
 #include <string.h>

@@ -1,5 +1,5 @@
-/* All files of the FMU except the derivatives in one unit, because their functions are static. A file uses the files
-   before it. Headers have what is used before its file, or by the derivatives. */
+/* All files of the FMU, except the derivatives, in one compilation unit, because their functions are static. A file
+   uses the files before it. The headers declare what an earlier file or the derivatives use. */
 #include "engine.c"
 #include "dormand_prince.c"
 #include "polynomial.c"

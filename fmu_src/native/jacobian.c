@@ -106,7 +106,7 @@ static void add_inverse_dynamics(const JointMotion motion[N_BODIES], const Joint
         }
 }
 
-/* The Jacobian's columns J_i turn with the joints j before them. */
+/* The Jacobian's columns J_i rotate with the joints j before them. */
 static void add_force(const double f[3], const JointMotion motion[N_BODIES], Matrix slope)
 {
     for (int j = END_BODY; j >= 0; j = PARENT[j]) {

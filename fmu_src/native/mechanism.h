@@ -98,7 +98,7 @@ typedef struct {
     double R[3][3], p[3], ratio[2];
 } JointFrame;
 
-/* Of all bodies that a joint moves: the angular part of Bᵀ s, whose linear part is 0, I s, and with the motion x of a
+/* For all bodies that a joint moves: the angular part of Bᵀ s, whose linear part is 0, I s, and with the motion x of a
    joint before it, derivatives of their effort on that joint: by q, by_q·x, and by v, by_v·x. */
 typedef struct {
     double coriolis[3], inertial[6], by_q[6], by_v[6];

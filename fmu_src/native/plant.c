@@ -20,7 +20,7 @@ typedef struct {
     double value[N_VARIABLES];
 } Plant;
 
-enum { N_STATES = 2 * N_JOINTS }; /* q and v are adjacent in the table, and so are their derivatives */
+enum { N_STATES = 2 * N_JOINTS }; /* q and v are adjacent in the table, as are their derivatives */
 
 /* States of Model Exchange, and its event indicators, which a controller alone does not have. */
 enum { N_CONTINUOUS = IS_CONTROLLER ? 0 : N_STATES, N_EVENTS = IS_CONTROLLER ? 0 : N_INDICATORS };

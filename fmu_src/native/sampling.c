@@ -5,7 +5,7 @@
 
 enum { MOST_PERIODS = 10 }; /* longest delay */
 
-/* Who takes the samples: the FMU, or the importer with a clock, which is active while it ticks. */
+/* The FMU takes the samples itself (NO_CLOCK), or the importer by a clock, which is active while it ticks. */
 typedef enum { NO_CLOCK, INACTIVE, ACTIVE } Clock;
 
 /* Discrete state of the controller and its sensors. The acting effort is the plant's output tau. */

@@ -49,8 +49,8 @@ __declspec(dllexport)
 #elif defined __GNUC__
 __attribute__((visibility("default")))
 #endif
-/* Steps from each of the times on; returns the number of rows of outputs, which ends with one that is not finite.
-   Failed is the index of a call that was refused, and its status; the index is that after the last call otherwise. */
+/* Do one step from each of the times; return the number of rows of outputs. A row that is not finite is the last one.
+   failed receives the index of the call that was refused and its status; without a refusal, the index is count. */
 int PREFIXED(twodof_span)(const Prepared *calls, int count, const double *times, double h, int steps, const double *rows,
                           size_t width, int failed[2])
 {

@@ -1,16 +1,17 @@
-/* Derivatives of the task law by the states, where J has full rank. The law's acceleration q̈_cmd moves the task frame
-   with the wanted acceleration w, and moves the joints beside the task by −Kn v. So with N = I − J⁺J
+/* Derivatives of the task law with respect to the states, where J has full rank. The law's acceleration q̈_cmd moves the
+   task frame with the wanted acceleration w. In the null space of the task, the joints have the acceleration −Kn v.
+   Therefore, with N = I − J⁺J
 
        ẍ(q, v, q̈_cmd) = w(q, v),     N q̈_cmd = −Kn N v
        δq̈_cmd = J⁺ (δw − δẍ) + N (δJᵀ J⁺ᵀ (q̈_cmd + Kn v) − Kn δv)
 
-   Sources: Golub & Pereyra, SIAM J. Numer. Anal. 10(2), 1973; of δẍ, as that of jacobian.c. */
+   Sources: Golub & Pereyra, SIAM J. Numer. Anal. 10(2), 1973; of δẍ, that of jacobian.c. */
 #include "control.h"
 
 #include <string.h>
 
-/* Of the joints on the way to the task frame: rows of the derivatives of the wanted and the actual acceleration, by q
-   and v, and δJᵀ y by q. */
+/* For the joints between the root and the task frame: rows of the derivatives of the wanted and the actual acceleration
+   with respect to q and v, and δJᵀ y with respect to q. */
 typedef struct {
     double by_q[N_ROWS][N_JOINTS], by_v[N_ROWS][N_JOINTS];
     Matrix turned;
@@ -92,8 +93,8 @@ static void add_rows(const double value[N_VARIABLES], const double error[3], con
 #endif
 }
 
-/* Add δJᵀ y by q: joint j turns the columns of J of the joints i after it, and moves the task frame for those before
-   it. y has angular and linear components in the root's axes. */
+/* Add δJᵀ y with respect to q: joint j rotates the columns of J of the joints i after it, and moves the task frame for
+   those before it. y has angular and linear components in the root's axes. */
 static void add_turned(const JointMotion motion[N_BODIES], const double y[6], Matrix turned)
 {
     add_force(&y[3], motion, turned);

@@ -93,11 +93,11 @@ def call(options: argparse.Namespace) -> int:
         raise CommandLineError("a URDF is given twice, as an argument and with --urdf")
     check_company(options, needs={"--mesh-dir": "a URDF"}, excludes={"--no-meshes": "--mesh-dir"})
     if options.orientation and options.control != "task":
-        raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
+        raise CommandLineError(f"--orientation needs --control task, not {options.control}")
     if options.part == "split" and (options.output or "").endswith(".fmu"):
         raise CommandLineError(f"'{options.output}': the name of a system of FMUs ends in .ssp")
     if options.scalars and options.fmi != 3:
-        raise CommandLineError("--scalars goes with --native --fmi 3")
+        raise CommandLineError("--scalars needs --native --fmi 3")
     with busy("building", silent=True):
         path = _build(options)
     if not path.is_file():  # a pipe, from which nothing is read back

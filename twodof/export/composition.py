@@ -116,7 +116,7 @@ def _flavour(
             other = f"; `fmi` {5 - fmi} has it" if platform in TARGETS else choice(platform, PLATFORMS[fmi])
             raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'{other}")
     if fmi == 2 and not options.arrays:
-        raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` goes with `fmi=3`")
+        raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` needs `fmi=3`")
     return native_flavour(options, robot, table, fmi, platforms, links)
 
 

@@ -95,7 +95,7 @@ class FmuOptions:
                 known = [*FREE, *(f"{group}:LINK" for group in OF_LINKS)]
                 raise BuildError(f"`free` '{name}' is not a parameter that can be an input{choice(name, known)}")
         if self.free and (not self.native or self.part != "all"):
-            raise BuildError("`free` goes with the whole robot as a native FMU, `native=True`")
+            raise BuildError("`free` needs the whole robot as a native FMU, `native=True`")
         if self.part == "controller" and self.outputs:
             raise BuildError("M, h, J and drift are outputs of the plant, which the controller alone does not have")
         if self.part == "split" and self.control == "effort":
@@ -106,7 +106,7 @@ class FmuOptions:
             raise BuildError("the controller alone must be native, `native=True`, with a control law other than 'effort'")
 
         if self.clocked and (self.part != "controller" or self.fmi != 3):
-            raise BuildError("`clocked` goes with `part` controller and `fmi` 3")
+            raise BuildError("`clocked` needs `part` controller and `fmi` 3")
 
     @property
     def is_default_arm(self) -> bool:

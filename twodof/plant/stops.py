@@ -249,7 +249,7 @@ def _complementary(
     The active bound of a joint with bounds is −1 for the lower, 1 for the upper, and 0 for none. b + W z is above 0
     only if z is at its lower bound, below 0 only if z is at its upper bound, and 0 for ``fixed`` joints, whose z has
     no bounds. z exceeds a bound only if it does so by more than the rounding error of the largest effort or impulse,
-    of z and of those that act besides (``acting``). Each iteration changes all violated conditions (block pivoting).
+    which is in z or is ``acting``. Each iteration changes all violated conditions (block pivoting).
     If their number does not decrease for some iterations, only the last one changes, which terminates for every
     positive definite W. Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974.
     """
