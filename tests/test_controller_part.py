@@ -295,7 +295,7 @@ def test_a_split_robot_is_built_again_byte_by_byte(ssp: Path, fmi: int, tmp_path
     twodof.build_fmu(again, options)
     with pytest.raises(BuildError, match="is another file, and is not replaced"):
         twodof.build_fmu(again, twodof.FmuOptions(part="split"))
-    with pytest.raises(BuildError, match="a split robot has a control law"):
+    with pytest.raises(BuildError, match="a split robot needs a control law"):
         twodof.FmuOptions(part="split", control="effort")
 
 
