@@ -44,7 +44,7 @@ def add(build: Parser) -> None:
     option("--control", choices=("task", "joint", "effort"), default="task", help=text)
     text = "robot under its control law, or the control law alone, as a native FMU (%(default)s)"
     option("--part", choices=("all", "controller"), default="all", help=text)
-    text = "add an input clock, which samples the controller, for tools with event mode; needs --part controller and --fmi 3"
+    text = "add a clock input that samples the controller, for tools with event mode (--part controller --fmi 3)"
     flag("--clocked", help=text)
     text = "build plant and controller as two native FMUs, connected in an SSP file"
     option("--split", action="store_const", dest="part", const="split", help=text)

@@ -32,7 +32,7 @@ def add(run: Parser) -> None:
     add_output(run, "BAG", "default: rosbag2_<date and time>")
     add_options(run, "--stop-time", "--step")
     run.add_argument("--measured", action="store_true", help="record measured and true joint states")
-    run.add_argument("--signals", action="store_true", help="record all real outputs of the FMU, or of all FMUs of a system")
+    run.add_argument("--signals", action="store_true", help="record all real outputs of an FMU or a system's FMUs")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run, "TwoDof.fmu, built if it is missing", "FMU|SSP|URDF")
     add_options(run, "--robot", "--frame", *OF_A_RUN)

@@ -103,7 +103,7 @@ class FmuOptions:
         if self.part != "all" and self.reference:
             raise BuildError("reference trajectories need the whole robot under its control law; leave out `reference`")
         if self.part == "controller" and (not self.native or self.control == "effort"):
-            raise BuildError("the controller alone must be native, `native=True`, with a control law other than 'effort'")
+            raise BuildError("the controller alone must be native, `native=True`, and have another law than 'effort'")
 
         if self.clocked and (self.part != "controller" or self.fmi != 3):
             raise BuildError("`clocked` needs `part` controller and `fmi` 3")

@@ -100,9 +100,7 @@ def load_fmu(path: str | Path, robot: str = "") -> Fmu:
     if has_member(path, STRUCTURE):
         return load_system(path, robot)
     if robot:
-        raise FmuError(
-            f"'{path}' is an FMU, which has no components; leave out `robot` '{robot}'"
-        )
+        raise FmuError(f"'{path}' is an FMU, which has no components; leave out `robot` '{robot}'")
     return logged(load_any_fmu(path))
 
 
