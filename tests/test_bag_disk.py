@@ -28,7 +28,7 @@ def test_an_unfinished_database_in_a_read_only_folder_is_read(native_path, tmp_p
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_messages_are_on_the_disk_before_metadata_says_that_they_are(native_path, tmp_path, monkeypatch, storage):
+def test_messages_are_on_the_disk_before_metadata_counts_them(native_path, tmp_path, monkeypatch, storage):
     told: list[tuple[str, int]] = []
     fsync, replace = os.fsync, Path.replace
 

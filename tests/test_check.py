@@ -117,7 +117,7 @@ def test_fmus_of_this_project_pass(kind: str, tmp_path: Path, fmu_path: Path, na
 
 
 @pytest.mark.parametrize("more", ["</ModelVariables>", DISCRETE])
-def test_an_fmu_of_another_maker_passes_with_a_remark(more: str, tmp_path: Path) -> None:
+def test_a_third_party_fmu_passes_with_a_remark(more: str, tmp_path: Path) -> None:
     check = twodof.check(foreign(tmp_path, description=DESCRIPTION.replace("</ModelVariables>", more)))
     others = {row.name: row.outcome for row in check.rows if row.outcome != "passed"}
     assert others == {"call order": "remark", "references": "does not apply"}

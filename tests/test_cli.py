@@ -73,7 +73,7 @@ def test_run_leaves_the_messages_that_it_promises(session):
     assert bag.stamps[0] == 1000 * 10**9
 
 
-def test_run_says_how_far_the_end_effector_is_from_its_target(session):
+def test_run_prints_the_distance_of_the_end_effector_from_its_target(session):
     found = rows(session["run"])["verdict"]
     promised = re.match(r"not reached: (\S+) m from the target \(0.2, 0.05\) m; the position still approaches", found)
     assert promised is not None
@@ -296,7 +296,7 @@ def test_messages_name_arguments_in_python_and_options_on_the_command_line(nativ
     assert "choose another with -o or give --overwrite" in capsys.readouterr().err
 
 
-def test_one_value_for_a_vector_says_that_it_was_spread(native_path, tmp_path, capsys):
+def test_one_value_for_a_vector_is_reported_for_all_elements(native_path, tmp_path, capsys):
     options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--set", "Kp=60"]
     assert main(["run", str(native_path), *options]) == 0
     assert "Kp       60, all 2 elements\n" in capsys.readouterr().out
@@ -304,7 +304,7 @@ def test_one_value_for_a_vector_says_that_it_was_spread(native_path, tmp_path, c
     assert given["Kp[1]"] == given["Kp[2]"] == 60.0
 
 
-def test_a_column_for_a_vector_says_that_it_was_spread(native_path, tmp_path, caplog):
+def test_a_column_for_a_vector_is_reported_for_all_elements(native_path, tmp_path, caplog):
     (tmp_path / "x.csv").write_text("time,Kp,x_des[1]\n0,60,0.2\n")
     options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--input", str(tmp_path / "x.csv")]
     assert main(["run", str(native_path), *options]) == 0

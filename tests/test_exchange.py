@@ -303,7 +303,7 @@ def test_a_held_joint_is_released_where_it_is_pulled_off_and_no_sooner(fmus, rig
     assert model.rates()[2] < 0.0 < model.indicators()[0]
 
 
-def test_a_solvers_rounding_does_not_let_a_held_joint_go(fmus):
+def test_a_solvers_rounding_does_not_release_a_held_joint(fmus):
     model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0], tau_cmd=[0.5, 0.0])
     model.go()
     model.y = [1.0 - 1e-12, 0.0, -1e-17, 0.0]

@@ -80,7 +80,7 @@ def test_friction_and_payload_are_found_without_efforts(bag):
         ({"Kp[1]": None}, "does not"),
     ],
 )
-def test_a_bag_that_does_not_tell_its_efforts_is_refused(change, message, bag, tmp_path):
+def test_a_bag_without_efforts_or_their_law_is_refused(change, message, bag, tmp_path):
     copy = shutil.copytree(bag, tmp_path / "bag")
     run = json.loads((copy / "run.json").read_text("utf-8"))
     if change is None:

@@ -99,7 +99,7 @@ def test_names_are_text_on_the_page(result: twodof.Fit, tmp_path: Path) -> None:
         assert page.locator("iframe, img, a[href^=javascript]").count() == 0
 
 
-def test_without_plotly_the_folder_has_no_page_and_the_command_says_so(
+def test_without_plotly_the_folder_has_no_page_and_the_command_reports_it(
     result: twodof.Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "plotly.offline", None)

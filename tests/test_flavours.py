@@ -61,7 +61,7 @@ def test_run_native_beside_an_fmu_is_refused(native_path, capsys):
     assert "--native builds the default arm's FMU" in capsys.readouterr().err
 
 
-def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(tmp_path, monkeypatch, capsys):
+def test_a_host_without_the_python_flavour_takes_the_native_one_and_reports_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("twodof.export.compiler.host_platform", lambda fmi=2: "darwin64")
     monkeypatch.setattr("twodof.export.composition.host_platform", lambda fmi=2: "linux64")  # what can run here

@@ -71,7 +71,7 @@ def fields(value: Any) -> Any:
     return [*map(fields, parts)] if isinstance(parts, list) else parts
 
 
-def test_the_command_line_tells_where_it_listens(native_path, number):
+def test_the_command_line_prints_the_address(native_path, number):
     options = ["--foxglove", "--foxglove-port", "0", "--scene"]
     with published(number, native_path, *options) as process:
         assert process.stdout is not None
@@ -156,7 +156,7 @@ def test_websites_but_foxgloves_own_are_refused(native_path):
 
 @pytest.mark.needs("linux")
 @pytest.mark.parametrize(("set_gains", "status"), [(False, b"101"), (True, b"403")])
-def test_gains_are_no_business_of_other_users(native_path, set_gains, status, monkeypatch):
+def test_other_users_cannot_set_gains(native_path, set_gains, status, monkeypatch):
     asked = ("Host", "localhost"), ("Sec-WebSocket-Protocol", "foxglove.sdk.v1"), *UPGRADE
     head = "".join(f"{name}: {value}\r\n" for name, value in asked)
     viewer = Foxglove(0, set_gains=set_gains).begin(twodof.experiment(native_path))
@@ -167,7 +167,7 @@ def test_gains_are_no_business_of_other_users(native_path, set_gains, status, mo
 
 
 @pytest.mark.needs("linux")
-def test_the_server_behind_the_door_answers_this_process_alone(native_path):
+def test_the_server_behind_the_relay_answers_this_process_alone(native_path):
     """Every user sees the port of Foxglove's SDK in the kernel's list of sockets."""
     with Foxglove(0, set_gains=True).begin(twodof.experiment(native_path)) as viewer:
         own = {os.path.realpath(f"/proc/self/fd/{n}").rpartition("/")[2] for n in os.listdir("/proc/self/fd")}

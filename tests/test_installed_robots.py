@@ -95,7 +95,7 @@ def test_the_cache_of_robot_descriptions_is_listed(tmp_path, monkeypatch, capsys
     assert twodof.stock_robot("single").frame == "EndEffector"
 
 
-def test_a_list_without_robots_says_how_to_have_them(tmp_path, monkeypatch, capsys):
+def test_an_empty_list_of_robots_names_the_remedy(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path))
     monkeypatch.setattr("twodof.export.stock_robots.PACKAGE", "no-such-package")
     assert main(["build", "--list-robots"]) == 1

@@ -175,7 +175,7 @@ def test_half_a_turn_from_the_target_is_refused(ur10):
 
 
 @pytest.mark.parametrize(("tau", "told"), [(9.9, ""), (10.0, "refused"), (-12.0, "saturated")])
-def test_an_effort_limit_is_refused_or_told(tau, told, bare):
+def test_an_effort_limit_is_refused_or_reported(tau, told, bare):
     """The URDF's limit is 10 N·m."""
     at = {"q": [0.3, 0.4], "tau_cmd": [tau, 0.1], "limit_effort": True}
     if told == "refused":

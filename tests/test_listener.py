@@ -172,7 +172,7 @@ def test_a_controller_in_real_time_misses_nothing(bare, tmp_path, number, listen
         ),
     ],
 )
-def test_lockstep_says_who_is_missing(bare, tmp_path, number, listen, topics, command, missing):
+def test_lockstep_names_the_missing_node(bare, tmp_path, number, listen, topics, command, missing):
     node = listen(*topics) if topics else None
 
     def opened(publisher: twodof.Publisher) -> None:

@@ -213,7 +213,7 @@ def test_two_viewers_see_and_steer_the_same(command, page):
     assert page.title() == "2dof - twodof"
 
 
-def test_a_parameter_begins_the_run_anew(page):
+def test_a_parameter_restarts_the_run(page):
     press(page, "Step")
     until(page, lambda found: found["time"] == "0.010 s")
     type_into(page, "payload, kg", 0.5)

@@ -331,7 +331,7 @@ def other_maker(tmp_path_factory):
 
 
 @in_child_process
-def test_an_fmu_of_another_maker_runs_where_its_variables_match(other_maker, tmp_path):
+def test_a_third_party_fmu_runs_if_its_variables_match(other_maker, tmp_path):
     run = twodof.experiment(other_maker, stop_time=0.05, settings={"rate": 3.0})
     recorder = Recorder()
     twodof.simulate(run, recorder, twodof.Bag(tmp_path / "bag"))
@@ -340,7 +340,7 @@ def test_an_fmu_of_another_maker_runs_where_its_variables_match(other_maker, tmp
     assert twodof.read_bag(tmp_path / "bag").joints == ("joint1",)
 
 
-def test_an_fmu_for_another_platform_says_which(fmu_path, tmp_path):
+def test_an_fmu_for_another_platform_is_refused_with_its_platforms(fmu_path, tmp_path):
     other = tmp_path / "Win.fmu"
     with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
         for name in archive.namelist():

@@ -217,7 +217,7 @@ def test_nothing_but_the_names_of_meshes_changes(disk):
     assert ET.canonicalize(after, with_comments=True) == ET.canonicalize(expected, with_comments=True)
 
 
-def test_characters_that_trouble_file_systems_are_replaced(disk):
+def test_characters_that_file_systems_refuse_are_replaced(disk):
     _, files = collect_meshes(urdf("package://arm_description/meshes/with%20space%20%26%20more.stl"), disk, disk / "ws")
     assert list(files) == ["meshes/with_space___more.stl"]
 

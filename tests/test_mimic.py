@@ -162,7 +162,7 @@ def test_geometry_of_many_samples_is_that_of_the_plant(robots: Path) -> None:
 
 
 @pytest.mark.parametrize("known", ["leader", "both"])
-def test_pictures_of_a_bag_follow_the_leader_unless_the_bag_says_otherwise(robots: Path, known: str) -> None:
+def test_pictures_of_a_bag_follow_the_leader_unless_the_bag_has_other_positions(robots: Path, known: str) -> None:
     from twodof.plots.linkage import load_linkage
 
     text, frame = (robots / PANDA).read_text(), "panda_rightfinger"

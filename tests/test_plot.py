@@ -93,7 +93,7 @@ def test_a_metre_is_as_long_up_as_across(default):
     assert left > -LINK  # of the circle of reach a part
 
 
-def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default, figure):
+def test_error_is_that_of_the_fmus_outputs_and_of_the_closed_form(default, figure):
     error = panels(figure).error
     assert error is not None
     assert error.get_yscale() == "log"

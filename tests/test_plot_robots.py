@@ -163,7 +163,7 @@ def test_many_joints_fit_on_a_page(count, low, high, tmp_path):
 # --- third-party bags ---
 
 
-def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign):
+def test_a_third_party_bag_is_drawn_as_far_as_its_data_allow(foreign):
     t, q, v = waves(6)
     figure = plot(foreign)
     found = panels(figure)

@@ -301,7 +301,7 @@ def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(native_
     )
 
 
-def test_provenance_says_where_it_was_full(run, tmp_path, monkeypatch):
+def test_provenance_has_the_time_at_which_it_was_full(run, tmp_path, monkeypatch):
     monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", MAX_TAIL + 20_000)
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(1000):

@@ -223,7 +223,7 @@ def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(native_path
     assert re.search(rf"\d+ of {len(stamps)} missed", out)
 
 
-def test_two_publishers_on_one_topic_are_both_heard(native_path, tmp_path, number, listen):
+def test_two_publishers_on_one_topic_are_both_received(native_path, tmp_path, number, listen):
     node = listen("/joint_states")
     bags = [tmp_path / "one", tmp_path / "two"]
     runs = [["--stop-time", "4", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
@@ -326,7 +326,7 @@ SHELLS = (  # of its ranges LOCALHOST and SUBNET
 
 
 @pytest.mark.parametrize("variables", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}])
-def test_cyclone_dds_as_jazzy_configures_it_hears(native_path, number, variables):
+def test_cyclone_dds_as_jazzy_configures_it_receives(native_path, number, variables):
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     with published(number, native_path, inside=isolated(CABLE), **variables) as process:
         enter = ["nsenter", "--net", "--target", str(process.pid)]

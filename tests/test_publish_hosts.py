@@ -97,7 +97,7 @@ def other_host(process: subprocess.Popen[str]) -> Iterator[int]:
         (["--subnet"], {}, "range SUBNET (other hosts too)", True),
     ],
 )
-def test_other_hosts_are_obeyed_only_with_permission(native_path, tmp_path, number, options, variables, said, open_to):
+def test_other_hosts_command_only_with_permission(native_path, tmp_path, number, options, variables, said, open_to):
     """One announces itself to each of the run's ports, listens and commands."""
     bag, inside = tmp_path / "bag", isolated(CABLE)
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}

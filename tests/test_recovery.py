@@ -360,7 +360,7 @@ def test_complete_bag_is_left_as_it_is(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("damage", ["metadata.yaml", "short metadata", "mcap"])
-def test_damaged_bag_is_made_anew(run, tmp_path, damage):
+def test_damaged_bag_is_written_again(run, tmp_path, damage):
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(20):
             bag.write(sample(run, k))

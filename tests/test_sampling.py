@@ -276,7 +276,7 @@ def test_the_logarithm_is_right_to_four_units_in_the_last_place():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_flavour_has_the_same_noise_to_the_bit(fmus, kind):
+def test_every_flavour_has_bit_identical_noise(fmus, kind):
     """A joint at rest at 0 shows only noise; without a period, sensors are sampled at communication points."""
     for seed in (0, 1, 2**31 - 1):
         rows = run(fmus("slider", "effort", kind), 0.5, 0.01, q_start=0.0, q_noise=1.0, v_noise=1.0, seed=seed)
@@ -302,7 +302,7 @@ int main(void)
 
 
 @pytest.mark.parametrize("machine", ["here", "ARM", "Windows"])
-def test_every_platform_has_the_same_noise_to_the_bit(machine, tmp_path):
+def test_every_platform_has_bit_identical_noise(machine, tmp_path):
     """Compiled with the flags of FMUs; run by qemu and wine."""
     (tmp_path / "main.c").write_text(NOISE)
     sources, program = Path(__file__).parents[1] / "fmu_src/native", tmp_path / "noise.exe"

@@ -99,7 +99,7 @@ def test_an_fmu_runs_the_code_inside_its_own_zip(fmu_path, tmp_path):
 
 
 @in_child_process
-def test_the_unzip_folder_and_the_working_directory_may_go(fmu_path, tmp_path):
+def test_the_unzip_folder_and_the_working_directory_may_be_removed(fmu_path, tmp_path):
     (tmp_path / "gone").mkdir()
     os.chdir(tmp_path / "gone")
     first = Driver(fmu_path).initialise()

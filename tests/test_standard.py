@@ -314,7 +314,7 @@ def test_numbers_are_those_that_every_reader_knows(texts: dict[str, bytes]) -> N
                         assert float(word) == 0.0 or abs(float(word)) >= np.finfo(float).tiny
 
 
-def test_documentation_says_which_version_it_is(fmus: dict[int, Path], fmu_path: Path) -> None:
+def test_documentation_has_the_version(fmus: dict[int, Path], fmu_path: Path) -> None:
     for path, version in ((fmus[2], "2.0"), (fmus[3], "3.0"), (fmu_path, "2.0")):
         with zipfile.ZipFile(path) as archive:
             page = archive.read("documentation/index.html").decode()

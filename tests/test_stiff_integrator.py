@@ -103,7 +103,7 @@ def test_a_step_of_a_damped_arm_costs_few_evaluations(damping, monkeypatch):
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.1, 0.5])
-def test_joints_that_are_not_stiff_move_as_by_dormand_prince_to_the_bit(damping):
+def test_joints_that_are_not_stiff_move_as_by_dormand_prince_bit_for_bit(damping):
     of, changes = engine("twodof"), {"damping": [damping] * 2}
     one, other = (both(of, shipped(of, **changes, integrator=i), 20) for i in (AUTOMATIC, DORMAND_PRINCE))
     assert (one == other).all()
@@ -174,7 +174,7 @@ def test_samples_of_a_controller_are_taken_at_their_times(pendulum):
 
 @in_child_process
 @pytest.mark.parametrize("damping", [0.1, 1e4])
-def test_a_restored_fmu_goes_on_to_the_bit_in_both_flavours(damping, fmu_path, native_path):
+def test_a_restored_fmu_continues_bit_for_bit_in_both_flavours(damping, fmu_path, native_path):
     """It equals an FMU that did all steps, with either choice of the automatic integrator."""
     runs = []
     for path in (fmu_path, native_path):

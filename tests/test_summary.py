@@ -104,7 +104,7 @@ def test_a_summary_is_not_read_with_all_that_comes_before(bag):
         twodof.read_bag(bag)
 
 
-def test_a_summary_with_a_flipped_bit_is_not_believed(bag):
+def test_a_summary_with_a_flipped_bit_is_not_used(bag):
     file, chance = file_of(bag), random.Random(17)
     content = file.read_bytes()
     (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
@@ -119,7 +119,7 @@ def test_a_summary_with_a_flipped_bit_is_not_believed(bag):
 
 
 @pytest.mark.parametrize("field", [0, 22], ids=["messages", "chunks"])
-def test_numbers_that_contradict_each_other_are_not_believed(bag, field):
+def test_a_summary_of_contradictory_numbers_is_not_used(bag, field):
     """The checksum is valid; messages and those by channel, or chunks and their index, contradict each other."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
@@ -138,7 +138,7 @@ def test_a_chunk_index_has_no_more_channels_than_a_file():
             assert len(_chunk(Path("a.mcap"), record).counts) == channels
 
 
-def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(bag):
+def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_used(bag):
     """The checksum is valid, and a channel has another number."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
@@ -151,7 +151,7 @@ def test_a_summary_that_counts_messages_of_an_unknown_channel_is_not_believed(ba
     assert read_summary(file) is None
 
 
-def test_counts_that_the_index_contradicts_are_not_believed(bag, capsys, caplog):
+def test_counts_that_the_index_contradicts_are_not_used(bag, capsys, caplog):
     """The checksum is valid, and the statistics lack a message; the file has 12,006."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
@@ -223,7 +223,7 @@ def test_a_file_that_contradicts_metadata_is_reported_and_repaired(bag, capsys, 
     assert "3001 joint states" in capsys.readouterr().out
 
 
-def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag):
+def test_a_chunk_that_is_not_at_its_offset_in_the_summary_is_refused(bag):
     file = file_of(bag)
     summary, content = read_summary(file), bytearray(file.read_bytes())
     assert summary is not None

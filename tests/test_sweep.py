@@ -236,7 +236,7 @@ def test_a_missing_extra_is_named(package, extra, options, native_path, tmp_path
 # --- one instance, any outcome ---
 
 
-def test_a_runner_instantiates_once_and_repeats_to_the_bit(native_path, monkeypatch):
+def test_a_runner_instantiates_once_and_repeats_bit_for_bit(native_path, monkeypatch):
     """In any order, a run gives the results of a new instance."""
     made = []
     instantiate = runner_module.instantiate

@@ -117,7 +117,7 @@ def test_workers_run_the_package_that_the_program_runs(native_path, tmp_path):
         ("import os; os._exit(3)", "workers die as they start: exit status 3"),
     ],
 )
-def test_workers_that_cannot_start_tell_why(text, said, native_path, tmp_path, monkeypatch, started):
+def test_workers_that_cannot_start_report_the_reason(text, said, native_path, tmp_path, monkeypatch, started):
     (tmp_path / "numpy.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(TwoDofError, match=said):

@@ -196,7 +196,7 @@ def test_a_push_that_ended_before_the_end_is_named_with_the_time_that_its_error_
     assert twodof.simulate(fmu_of("arm", "task"), changes=push, stop_time=11.0).verdict.outcome == "reached"
 
 
-def test_a_run_that_starts_at_its_target_says_so() -> None:
+def test_a_run_that_starts_at_its_target_has_a_line_for_it() -> None:
     settings = {"payload": 1.0, "q_des": (0.5, 0.3), "q_start": (0.5, 0.3)}
     lines = twodof.simulate(fmu_of("arm", "joint"), settings=settings).verdict.lines
     assert any(line.startswith("the run starts at its target, ") for line in lines), "\n".join(lines)
@@ -207,7 +207,7 @@ def test_a_reached_target_needs_no_settings() -> None:
     assert lines[0].startswith("reached") and lines[1].endswith("steady at the end") and len(lines) == 3
 
 
-def test_an_arm_that_stops_short_of_the_nearest_point_says_so() -> None:
+def test_an_arm_that_stops_short_of_the_nearest_point_is_reported() -> None:
     settings = {"q_max": (0.6, 0.4), **failures.LARGE_STEPS}
     verdict = twodof.simulate(fmu_of("arm", "task"), settings=settings).verdict
     (reach,) = (cause for cause in verdict.causes if cause.kind == "reach")
@@ -467,7 +467,7 @@ def test_a_condition_is_refused_before_the_run(
     assert reason in capsys.readouterr().err and not (tmp_path / "bag").exists()
 
 
-def test_a_run_without_a_target_says_so() -> None:
+def test_a_run_without_a_target_has_a_line_for_it() -> None:
     run = twodof.simulate(fmu_of("arm", "effort"), settings=failures.LARGE_STEPS, stop_time=2.0)
     assert run.verdict.outcome == "no target" and run.verdict.lines[0].startswith("no target")
     assert not {"final_error", "final_joint_error", "settling_time", "overshoot"} & {*run.verdict.numbers}
