@@ -202,6 +202,19 @@ def test_variable_that_is_both_set_and_in_the_table_is_refused(fmu, tmp_path, se
         twodof.experiment(fmu, settings=settings, input_file=tmp_path / "inputs.csv", stamp_start=0)
 
 
+def test_a_column_of_a_vector_counts_for_each_element(fmu, tmp_path, monkeypatch):
+    monkeypatch.setattr("twodof.simulation.input_values.MAX_CELLS", 9)
+    path = tmp_path / "inputs.csv"
+    path.write_text("time,x_des\n" + "0,0.1\n" * 4)  # 10 cells as written
+    with pytest.raises(InputError, match=r"more than 9 cells$"):
+        twodof.experiment(fmu, input_file=path)
+    path.write_text("x_des,time\n0.1,0\n" + "0.1,0\n" * 2)
+    twodof.experiment(fmu, input_file=path)
+    monkeypatch.setattr("twodof.simulation.input_values.MAX_CELLS", 8)
+    with pytest.raises(InputError, match="more than 8 cells; a vector's column counts for each element"):
+        twodof.experiment(fmu, input_file=path)
+
+
 # --- a run ---
 
 STEP = 0.01

@@ -210,6 +210,15 @@ def test_two_versions_of_a_python_fmu_run_their_own_code(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_a_bag_whose_name_is_not_text_has_a_plot_of_its_failure(runs, tmp_path, monkeypatch):
+    bag = dataclasses.replace(twodof.read_bag(runs["good"]), path=Path(os.fsdecode(b"b\xff")))
+    monkeypatch.setattr("twodof.testing.assertions.REPORT", [tmp_path])
+    with pytest.raises(AssertionError, match="plot: "):
+        assert_settles(bag, within=0.1)
+    (page,) = tmp_path.glob("*.html")
+    assert "b\\xff" in page.read_text("utf-8")
+
+
 def test_the_plugin_imports_nothing_heavy(tmp_path):
     (tmp_path / "test_light.py").write_text(
         "import sys\n\ndef test_light():\n    assert not {'numpy', 'fmpy', 'pinocchio', 'rosbags'} & {*sys.modules}\n"

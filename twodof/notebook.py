@@ -56,10 +56,11 @@ def busy(what: str) -> Iterator[None]:
 
 
 def card(title: str, facts: Mapping[str, object], picture: str = "") -> str:
-    """Return a table with a title, a row for each fact, and a picture next to it."""
+    """Return a table with a title, a row for each fact, and a picture next to it; file names may not be UTF-8."""
     rows = (f"<tr><th>{escape(name)}</th><td>{escape(str(fact))}</td></tr>" for name, fact in facts.items())
     table = f"<table><caption>{escape(title)}</caption>{''.join(rows)}</table>"
-    return f'<div style="display:flex;gap:1em;flex-wrap:wrap;align-items:center">{table}{picture}</div>'
+    text = f'<div style="display:flex;gap:1em;flex-wrap:wrap;align-items:center">{table}{picture}</div>'
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def picture(

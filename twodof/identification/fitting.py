@@ -248,7 +248,7 @@ def _result(
 ) -> Fit:
     robot = model.robot
     return Fit(
-        urdf=model.path.name,
+        urdf=shown(model.path.name),
         bags=tuple(shown(recording.path) for recording in recordings),
         fitted_urdf=fitted_urdf(model.text, model.urdf, parameters, found.values),
         joints=robot.joints,

@@ -73,6 +73,8 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     kinds = {name: KINDS[fmu.variables[own[0]].type] for name, own in elements.items()} | {"time": KINDS["Real"]}
     changes: Changes = []
     for line, row in rows:
+        if (len(changes) + 1) * len(columns) > MAX_CELLS:
+            raise InputError(f"'{path}' has more than {MAX_CELLS} cells; a vector's column counts for each element")
         if len(row) != len(header):
             raise InputError(f"'{path}' row {line}: {len(row)} cells, expected {len(header)}")
         values: dict[str, Value] = {}
