@@ -30,7 +30,7 @@ def write_dataset(bags: Sequence[Path], path: Path) -> None:
     """Write bags as the episodes of a dataset, a new folder.
 
     Its ``observation.state`` has positions and velocities of the joints. Its ``action`` has the target that applies
-    from a sample on: positions of the joints, or position and orientation of the end effector; or else the efforts.
+    from a sample on, of the joints or of the end effector. Without targets, it has the efforts.
 
     Raises:
         BagError: the folder exists or cannot be written, pandas or pyarrow is missing, a bag cannot be read, the bags

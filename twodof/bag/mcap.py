@@ -75,8 +75,8 @@ def read_metadata(path: Path, name: str, key: str) -> str:
 def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) -> Iterator[Batch]:
     """Return the messages of a chunk, those of a channel that have equal lengths together: a batch takes 20 µs.
 
-    If records repeat periodically, as they mostly do in bags of ROS 2, all of them are read at once: one by one, each
-    would take a microsecond.
+    If records repeat periodically, as in most bags of ROS 2, all of them are read at once. One by one, each would take
+    a microsecond.
     """
     position = patience = 0
     seen: dict[bytes, int] = {}  # different headers of the latest message records, and their offsets

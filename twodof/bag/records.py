@@ -63,8 +63,8 @@ class ReadBudget:
     """Read budget of a bag: the bytes to which its files may still unpack.
 
     A few bytes can unpack to millions of bytes, or to an unlimited number of equal records. The messages of an honest
-    bag differ at least in their time stamps. Therefore, apart from one large chunk, a bag may unpack to at most
-    MAX_RATIO times the bytes that were read, and each record counts as RECORD bytes more.
+    bag differ at least in their time stamps. In addition to one large chunk, a bag may therefore unpack to at most
+    MAX_RATIO times the bytes that were read. Each record counts as RECORD bytes more.
     """
 
     left: int = MAX_CHUNK

@@ -2,8 +2,8 @@
 
 Spatial vectors are in the root's axes about the task frame's origin, where rounding errors are small for distal joints.
 Motion vectors are (angular, linear), force vectors (moment, force). For each joint, s is its velocity at the unit
-velocity of the independent joint that it follows, v and a are the velocity and the acceleration of the body before it,
-and I, B and f are the inertia, the Coriolis matrix and the wrench of all bodies that it moves:
+velocity of the independent joint that it follows. v and a are the velocity and the acceleration of the body before it.
+I, B and f are the inertia, the Coriolis matrix and the wrench of all bodies that it moves:
 
     ψ = v × s,   χ = a × s + v × ψ,                    I = Σ I_k,   B = Σ B_k,   f = Σ (I_k a_k + v_k ×* I_k v_k)
     ∂τ_i/∂q_j = sᵢᵀ (2 B_i ψ_j + I_i χ_j)              ∂τ_j/∂q_i = sⱼᵀ (2 B_i ψ_i + I_i χ_i + sᵢ ×* f_i)

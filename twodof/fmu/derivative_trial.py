@@ -145,9 +145,9 @@ def _check_later(trial: Trial, instance: Instance, point: Point) -> None:
 def derivatives(trial: Trial) -> str:
     """Compare directional derivatives with central differences, at the start and, over inputs, after the steps.
 
-    Inputs and states are changed before initialisation. If the initialisation takes a sample, as that of a sampled
-    controller, its differences are no derivatives; inputs are then changed between two samples, after a part of a step,
-    and differences over states are no proof. An output that keeps its value while the state changes was sampled, too.
+    Inputs and states are changed before initialisation. If the initialisation takes a sample, as in a sampled
+    controller, differences across it are no derivatives. Inputs are then changed between two samples, after a part of a
+    step, and differences over states prove nothing. An output that keeps its value while the state changes was sampled.
     """
     trial.require("providesDirectionalDerivative")
     point = Point(trial)

@@ -38,7 +38,7 @@ class Instance:
     FMU log messages go to the logger "twodof.fmu". A call that the FMU refuses raises SimulationError with the FMU's
     message.
 
-    Calls of each step bypass FMPy: they call the library's functions without declared types, with arguments that were
+    Calls of each step bypass FMPy: they call the library's functions without declared types. Their arguments were
     converted once, because the conversion would take half of a call. Vectors of FMI 3.0 are set and read as a whole. A
     variable of FMI 2.0 is a vector of one element.
 

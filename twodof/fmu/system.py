@@ -27,8 +27,8 @@ Start = float | bool | str
 class System(Fmu):
     """A system of co-simulation FMUs, one of which is the robot.
 
-    ``variables`` has the system's connectors, the robot's variables, and inputs whose name no other component has, by
-    their own names; other variables of components are "component.name". A variable that a connection drives has the
+    ``variables`` has by their own names the system's connectors, the robot's variables, and inputs whose name no other
+    component has. Other variables of components are "component.name". A variable that a connection drives has the
     causality "local".
 
     Attributes:

@@ -53,7 +53,7 @@ class _AnswerError(Exception):
 class Meshes:
     """Mesh files of one robot, read in confined child processes that start on demand.
 
-    Use it as a context manager. The meshes share a process; as they belong to one robot, a mesh that corrupts the
+    Use it as a context manager. The meshes share a process. They belong to one robot: a mesh that corrupts the
     memory of its reader can only spoil the picture of this robot.
     """
 

@@ -9,8 +9,8 @@ Where a joint is expected to stop soon, a short step of one evaluation tries to 
 it, it is discarded, unless it ends with a hold of joints. Impacts on many joints with friction are followed by such
 events within microseconds.
 
-After a change of the rank, steps share the tolerances: motion back and forth across a singularity takes so many steps
-that their errors would add up to energy.
+After a change of the rank, steps share the tolerances. Motion back and forth across a singularity takes so many steps
+that their errors would add energy.
 """
 
 from collections.abc import Callable, Sequence

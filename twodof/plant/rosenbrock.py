@@ -8,7 +8,7 @@ the joint damping D and q̇ = v:
 
 with M⁻¹ at y, in which joints at rest are held. The dense output of q is the cubic through the positions and velocities
 at both ends. The dense output of v is a cubic with the accelerations at the ends, so that a joint begins to slip in the
-right direction. If an acceleration differs by more than the tolerance from that of q's cubic, the joint is stiff: small
+right direction. If an acceleration differs by more than the tolerance from that of q's cubic, the joint is stiff. Small
 errors of v become large errors of q̈. The acceleration of q's cubic then replaces it.
 
 Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of index
