@@ -19,7 +19,7 @@ import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from harness import python
+from harness import forged, python
 from tables import COMMAND, SMALL, same, table_of
 
 import twodof
@@ -158,6 +158,23 @@ def test_damaged_and_foreign_tables_get_one_line(native_path, tmp_path):
         read_sweep(tmp_path)
     with pytest.raises(TwoDofError, match=r"no sweep '.*none'; make one with 'twodof sweep'"):
         read_sweep(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["", "run", "outcome", "settling_time", "cost"])
+def test_a_variable_with_the_name_of_a_column_is_refused(name, native_path, tmp_path):
+    fmu = forged(native_path, tmp_path, 'name="payload"', f'name="{name or "payload"}"')
+    if name:
+        with pytest.raises(TwoDofError, match=f"{name} cannot be varied: a sweep's table has a column of its own"):
+            sweep(fmu, grid={name: [0.0, 0.1]}, output=tmp_path / "refused")
+        assert not (tmp_path / "refused").exists()
+    sweep(native_path, grid={"payload": [0.0]}, stop_time=0.02, output=tmp_path / "s")
+    file = tmp_path / "s/runs.parquet"
+    table = pq.read_table(file)
+    text = table.schema.metadata[b"twodof"].replace(b'"payload": [0', f'"{name}": [0'.encode())
+    renamed = table.rename_columns([name if column == "payload" else column for column in table.column_names])
+    pq.write_table(renamed.replace_schema_metadata({b"twodof": text}), file)
+    with pytest.raises(TwoDofError, match=r"runs\.parquet.: it is damaged"):
+        read_sweep(tmp_path / "s")
 
 
 def endless(table: pa.Table) -> pa.Table:

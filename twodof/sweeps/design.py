@@ -14,7 +14,8 @@ from ..fmu import Fmu
 from ..simulation.input_values import Setting, resolve
 from ..simulation.verdict import METRICS
 
-OTHERS = 4  # columns of a table besides variables and metrics
+OWN_COLUMNS = (*METRICS, "run", "end_time", "outcome", "message", "cost")
+"""Columns of a table besides the varied variables."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +87,15 @@ def make_design(
     design = Design(grids, limits, max(1, random), seed)
     if len(design) > MAX_RUNS:
         raise InputError(f"the design has {len(design)} runs; at most {MAX_RUNS} are possible")
-    if 8 * len(design) * (len(grids) + len(limits) + len(METRICS) + OTHERS) > MAX_SWEEP:
+    if 8 * len(design) * (len(grids) + len(limits) + len(OWN_COLUMNS)) > MAX_SWEEP:
         varied = f"{len(design)} runs over {len(grids) + len(limits)} variables"
         raise InputError(f"a table of {varied} exceeds {MAX_SWEEP // MIB} MiB; vary fewer, or in several sweeps")
     owner = dict.fromkeys(resolve(fmu, settings), "the settings")
     for name, values in {**grids, **limits}.items():
         if not values:
             raise InputError(f"the grid of {name} is empty")
+        if name in OWN_COLUMNS:
+            raise InputError(f"{name} cannot be varied: a sweep's table has a column of its own with this name")
         if len(set(values)) < len(values):
             raise InputError(f"the grid of {name} has a value twice")
         if not all(map(isfinite, values)):

@@ -18,6 +18,7 @@ from ..errors import SweepError
 from ..files import NUMBER, VALUES, check_file, fits, parsed
 from ..simulation.verdict import METRICS
 from ..version import needing
+from .design import OWN_COLUMNS
 
 with needing(SweepError, "read or write tables of sweeps", "sweep"):
     import pyarrow as pa
@@ -115,7 +116,8 @@ def _check_schema(file: Path, schema: pa.Schema) -> int:
     design = provenance_in(file, schema)["design"]
     names = [*design["grids"], *design["ranges"]]
     runs: int = prod(map(len, design["grids"].values())) * design["draws"]
-    if runs > MAX_RUNS or not schema.equals(schema_of(names, names, {})):
+    unclear = len({*names, *OWN_COLUMNS, ""}) < len(names) + len(OWN_COLUMNS) + 1
+    if runs > MAX_RUNS or unclear or not schema.equals(schema_of(names, names, {})):
         raise _damaged(file)
     return runs
 
