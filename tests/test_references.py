@@ -14,7 +14,10 @@ from unittest.mock import Mock
 import fmpy
 import lxml.etree
 import numpy as np
+import pinocchio as pin
 import pytest
+from friction_oracle import Rubbing
+from scipy.integrate import solve_ivp
 from systems import pd_fmu, values
 from tools import needs
 
@@ -30,6 +33,9 @@ from twodof.fmu.wiring import units_of
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
 MANIFEST = f"{FOLDER}fmi-ls-manifest.xml"
+EXPERIMENTS = ("move", "push", "sample", "rest")
+DOWN = {"gravity": (0.0, -9.81, 0.0)}
+ALL_PASSED = {f"reference {name}": "passed" for name in EXPERIMENTS}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +80,7 @@ def test_the_files_have_the_form_of_the_standards(built: Path) -> None:
         assert element.get("checksum") == hashlib.sha3_256(files[FOLDER + source]).hexdigest()
     assert [s for s, e in related.items() if e.get("role") == "experiment/smoke-test"] == ["references.exp"]
     schema = next(Path(fmpy.__file__).parent.rglob("SystemStructureParameterValues.xsd"))
-    for name in ("move", "push"):
+    for name in EXPERIMENTS:
         lxml.etree.XMLSchema(file=str(schema)).assertValid(lxml.etree.fromstring(files[f"{FOLDER}{name}.ssv"]))
 
 
@@ -82,10 +88,7 @@ def test_parameters_that_are_inputs_have_the_values_of_their_experiment(tmp_path
     free = ("payload", "payload_com", "armature", "damping", "mass:link2")
     options = twodof.FmuOptions(native=True, reference=True, free=free)
     found = rows(twodof.build_fmu(tmp_path / "arm.fmu", options))
-    assert {name: row.outcome for name, row in found.items()} == {
-        "reference move": "passed",
-        "reference push": "passed",
-    }
+    assert {name: row.outcome for name, row in found.items()} == ALL_PASSED
 
 
 def test_builds_are_identical_and_references_come_and_go(tmp_path: Path, native_path: Path, built: Path) -> None:
@@ -106,10 +109,7 @@ def test_builds_are_identical_and_references_come_and_go(tmp_path: Path, native_
 def test_fmus_meet_their_references(control: str, kind: str, tmp_path: Path) -> None:
     options = twodof.FmuOptions(control=control, reference=True, native=kind == "3", fmi=3 if kind == "3" else None)
     found = rows(twodof.build_fmu(tmp_path / "arm.fmu", options))
-    assert [(name, row.outcome) for name, row in found.items()] == [
-        ("reference move", "passed"),
-        ("reference push", "passed"),
-    ]
+    assert {name: row.outcome for name, row in found.items()} == ALL_PASSED
 
 
 def test_a_panda_meets_its_references_in_the_closed_form(panda: str, tmp_path: Path) -> None:
@@ -126,19 +126,35 @@ def test_a_panda_meets_its_references_in_the_closed_form(panda: str, tmp_path: P
 Changed = Callable[[str, str, str], Path]
 
 
+@pytest.fixture(scope="module")
+def rough(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A native FMU with references; its URDF has friction and damping."""
+    folder = tmp_path_factory.mktemp("rough")
+    urdf = (
+        (Path(__file__).parents[1] / "urdf/2dof.urdf")
+        .read_text()
+        .replace("<limit", '<dynamics friction="0.002" damping="0.001"/><limit')
+    )
+    (folder / "arm.urdf").write_text(urdf)
+    options = twodof.FmuOptions(
+        folder / "arm.urdf", native=True, reference=True, meshes=False, q_start=(0.5, 0.35), settings=DOWN
+    )
+    return twodof.build_fmu(folder / "arm.fmu", options)
+
+
 @pytest.fixture
-def changed(built: Path, tmp_path: Path) -> Changed:
-    """An FMU whose source has 1e-6 added to the first match of a pattern after some marks."""
+def changed(rough: Path, tmp_path: Path) -> Changed:
+    """An FMU whose source has the first match of a pattern after some marks multiplied by 1 + 1e-6."""
 
     def change(file: str, mark: str, pattern: str) -> Path:
-        files = members(built)
+        files = members(rough)
         sources = {Path(name).name: text for name, text in files.items() if name.startswith("sources/")}
         code, place = sources[file].decode(), 0
         for part in mark.split("|"):
-            place = code.index(part, place)
+            place = code.index(part, place) + len(part)
         match = re.compile(pattern).search(code, place)
         assert match
-        sources[file] = f"{code[: match.start()]}({match[0]} + 1e-6){code[match.end() :]}".encode()
+        sources[file] = f"{code[: match.start()]}({match[0]} * (1.0 + 1e-6)){code[match.end() :]}".encode()
         for name, text in sources.items():
             (tmp_path / name).write_bytes(text)
         command = [needs("gcc"), "-std=c99", "-shared", "-fPIC", *UNITS, "-o", "arm.so", "-lm"]
@@ -150,21 +166,33 @@ def changed(built: Path, tmp_path: Path) -> Changed:
 
 
 NUMBER = r"\d+\.\d+(e-?\d+)?"
+CONSTANTS = {
+    "mass": ("mechanism.c", "end_body->mass = ", NUMBER),
+    "centre of mass": ("mechanism.c", "void load_end_body(|#else|end_body->moment[0] = ", NUMBER),
+    "inertia": ("mechanism.c", "void load_end_body(|#else|end_body->inertia[5] = ", NUMBER),
+    "length": ("mechanism.c", "void task_frame(|#else", NUMBER),
+    "inverse dynamics": ("mechanism.c", "void inverse_dynamics(|#else", NUMBER),
+    "forward dynamics": ("mechanism.c", "void acceleration_of_effort(|#else", NUMBER),
+    "Dormand-Prince": ("dormand_prince.c", "{", r"19372\.0 / 6561"),
+    "sine": ("turn.c", "const double s =", r"1\.0 / 6"),
+    "noise": ("noise.c", "LN2 = ", NUMBER),
+}
 
 
-@pytest.mark.parametrize(
-    ("file", "mark"),
-    [
-        ("mechanism.c", "end_body->mass = "),
-        ("mechanism.c", "void inverse_dynamics(|#else"),
-        ("mechanism.c", "void acceleration_of_effort(|#else"),
-        ("dormand_prince.c", "{"),
-    ],
-)
-def test_a_constant_that_is_off_by_a_millionth_fails(changed: Changed, file: str, mark: str) -> None:
-    found = rows(changed(file, mark, NUMBER if file == "mechanism.c" else r"19372\.0 / 6561"))
+@pytest.mark.parametrize("kind", CONSTANTS)
+def test_a_constant_that_is_off_by_a_millionth_fails(kind: str, changed: Changed) -> None:
+    found = rows(changed(*CONSTANTS[kind]))
     texts = [row.text for row in found.values() if row.outcome == "failed"]
-    assert texts and all("the tolerance is 1e-10" in text for text in texts), found
+    assert texts and all("the tolerance is 1e-" in text for text in texts), found
+
+
+@pytest.mark.parametrize("name", ["Kp[1]", "Kd[1]", "gravity[2]", "friction[1]", "damping[2]", "q_start[1]"])
+def test_a_start_value_that_is_off_by_a_millionth_fails(name: str, rough: Path, changed: Changed) -> None:
+    """No file of the references has it."""
+    index = [*load_any_fmu(rough).variables].index(name)
+    found = rows(changed("model.h", "double START[|" + "{" + "|," * index, NUMBER))
+    texts = [row.text for row in found.values() if row.outcome == "failed"]
+    assert texts and all("the tolerance is 1e-" in text for text in texts), found
 
 
 @pytest.mark.parametrize(
@@ -190,6 +218,79 @@ def test_two_variables_that_are_exchanged_fail(one: str, other: str, built: Path
         text = re.sub(rf'(name="{re.escape(name)}" valueReference=")\d+', rf"\g<1>{number[1]}", text)
     changed = packed({**files, "modelDescription.xml": text.encode()}, tmp_path / "swapped.fmu")
     assert {name: row.outcome for name, row in rows(changed).items()}["reference push"] == "failed"
+
+
+def of_experiment(name: str, control: str, path: Path) -> tuple[Reference, dict[str, np.ndarray]]:
+    """Return an experiment of the default arm, and its results by vector, with the numbers of the steps as "k"."""
+    options = twodof.FmuOptions(control=control, reference=True, settings=DOWN)
+    fmu = load_any_fmu(twodof.build_fmu(path / "arm.fmu", options))
+    (reference,) = (each for each in references_of(fmu) if each.name == name)
+    names, numbers = reference.results
+    groups = {group: [f"{group}[1]", f"{group}[2]"] for group in ("q", "v", "tau", "q_meas", "v_meas")}
+    found = {group: numbers[:, [1 + names.index(own) for own in members]] for group, members in groups.items()}
+    return reference, {**found, "k": np.rint(numbers[:, 0] / reference.step).astype(int)}
+
+
+def pair(reference: Reference, k: int, group: str) -> np.ndarray:
+    """Return the values of a parameter or input after k steps."""
+    values = {**reference.parameters, **reference.inputs(k)}
+    names = (f"{group}[1]", f"{group}[2]")
+    return np.array([values.get(name, reference.variables[name].start_value) for name in names], dtype=float)
+
+
+@pytest.mark.parametrize("control", ["joint", "effort"])
+def test_friction_and_stops_are_those_of_an_event_driven_solution(control: str, tmp_path: Path) -> None:
+    """Joints stick, slip in both directions, and reach and leave stops."""
+    reference, found = of_experiment("rest", control, tmp_path)
+    model = pin.buildModelFromXML(twodof.load_fmu(tmp_path / "arm.fmu").urdf)
+    model.gravity.linear = np.array(DOWN["gravity"])
+    rows, q, v = [], pair(reference, 0, "q_start"), np.zeros(2)
+    for block in range(0, 50, 5):
+        given = {name: pair(reference, block, name) for name in ("q_des", "v_des", "Kp", "Kd") if control == "joint"}
+        pushed = pair(reference, block, "tau_ext") + (0.0 if given else pair(reference, block, "tau_cmd"))
+
+        def effort(q, v, M, h, given=given, pushed=pushed):
+            if not given:
+                return pushed
+            return pushed + h + M @ (given["Kp"] * (given["q_des"] - q) + given["Kd"] * (given["v_des"] - v))
+
+        limits = (pair(reference, 0, name) for name in ("friction", "damping", "armature", "q_min", "q_max"))
+        states, _ = Rubbing(model, effort, *limits).run(q, v, 0.01 * np.arange(1, 6))
+        rows += [*states]
+        q, v = states[-1][:2], states[-1][2:]
+    expected = np.array(rows)[found["k"] - 1]
+    np.testing.assert_allclose(np.hstack([found["q"], found["v"]]), expected, rtol=0.0, atol=1e-9)
+    at = np.isclose(found["q"], pair(reference, 0, "q_min")) | np.isclose(found["q"], pair(reference, 0, "q_max"))
+    still = found["v"] == 0.0
+    assert all(kind.any() for kind in (still & at, still & ~at, found["v"] > 0.0, found["v"] < 0.0))
+
+
+def test_a_sampled_motion_is_that_of_its_held_efforts(tmp_path: Path) -> None:
+    """Between samples the robot moves under a constant effort, that of the law at the previous measured state."""
+    reference, found = of_experiment("sample", "joint", tmp_path)
+    model = pin.buildModelFromXML(twodof.load_fmu(tmp_path / "arm.fmu").urdf)
+    model.gravity.linear, data = np.array(DOWN["gravity"]), model.createData()
+    seen = {k // 3: (q, v) for k, q, v in zip(found["k"], found["q_meas"], found["v_meas"])}
+    y, efforts, tau = np.r_[pair(reference, 0, "q_start"), np.zeros(2)], [], np.zeros(2)
+    noise = []
+    for k in range(50):
+        if k % 3 == 0:
+            q, v = seen[k // 3]
+            noise += [*(q - 1e-3 * np.round(y[:2] / 1e-3)) / 1e-3, *(v - y[2:]) / 1e-2]
+            off = [pair(reference, k, f"{g}_des") - x for g, x in (("q", q), ("v", v))]
+            efforts.append(pin.rnea(model, data, q, v, 25.0 * off[0] + 10.0 * off[1]).copy())
+        if k % 3 == 1:
+            tau = efforts[-1]
+
+        def rates(t, y, tau=tau):
+            return np.r_[y[2:], pin.aba(model, data, y[:2], y[2:], tau)]
+
+        y = solve_ivp(rates, (0.0, 0.01), y, "LSODA", rtol=1e-12, atol=1e-13).y[:, -1]
+        for row in np.flatnonzero(found["k"] == k + 1):
+            np.testing.assert_allclose(np.r_[found["q"][row], found["v"][row]], y, rtol=0.0, atol=1e-9)
+            if (k + 1) % 3 != 1:
+                np.testing.assert_allclose(found["tau"][row], tau, rtol=0.0, atol=1e-9)
+    assert len({*np.round(noise, 6)}) == len(noise) and 0.7 < np.std(noise) < 1.3
 
 
 SAME = ({"q", "q_meas"}, {"v", "v_meas", "der(q)"})
@@ -260,7 +361,7 @@ def test_another_tool_meets_them(tool: str, built: Path) -> None:
         needs("libcosimpy")
         needs("libatomic")
     found = rows(built, tool)
-    assert [row.outcome for row in found.values()] == ["passed"] * 4 and f"reference push with {tool}" in found
+    assert [row.outcome for row in found.values()] == ["passed"] * 8 and f"reference push with {tool}" in found
 
 
 def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
@@ -286,7 +387,7 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
         ("references.exp", b"<Experiments", b"<!DOCTYPE x><Experiments", "declares entities"),
         ("references.exp", b'stepSize="0.01"', b'stepSize="0"', "must be a run of at most"),
         ("push-ref.csv", b"time,", b"x" * 200_000 + b",", "field larger than field limit"),
-        ("references.exp", b'name="push"', b'name="move"', "two experiments have one name"),
+        ("references.exp", b'name="push"', b'name="move"', "have the same name"),
         ("references.exp", b'name="push"', b'name="' + b"p" * 1001 + b'"', "a name of more than 1000 characters"),
         ("push-in.csv", b"tau_ext[1]", b"tau_axt[1]", "there is no variable 'tau_axt[1]'"),
     ],
@@ -312,7 +413,7 @@ def test_the_cells_of_all_tables_are_limited(built: Path, monkeypatch: pytest.Mo
     tables = [content for name, content in members(built).items() if name.startswith(FOLDER) and name.endswith(".csv")]
     cells = sum(1 + line.count(b",") for table in tables for line in table.splitlines()[1:])
     monkeypatch.setattr("twodof.fmu.reference_runs.MAX_CELLS", cells)
-    assert len(references_of(load_any_fmu(built))) == 2
+    assert len(references_of(load_any_fmu(built))) == 4
     monkeypatch.setattr("twodof.fmu.reference_runs.MAX_CELLS", cells - 1)
     with pytest.raises(FmuError, match=f"the tables have more than {cells - 1} cells"):
         references_of(load_any_fmu(built))
@@ -444,9 +545,9 @@ def test_values_that_a_variable_cannot_have_are_refused(name: str, text: str, re
 
 
 def test_the_steps_of_all_experiments_together_are_limited(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two experiments of 50 steps."""
-    monkeypatch.setattr("twodof.fmu.reference_runs.MOST_STEPS", 101)
-    assert len(references_of(load_any_fmu(built))) == 2
-    monkeypatch.setattr("twodof.fmu.reference_runs.MOST_STEPS", 100)
-    with pytest.raises(FmuError, match="'push' must be a run of at most 100 whole steps, together with those before"):
+    """Four experiments of 50 steps."""
+    monkeypatch.setattr("twodof.fmu.reference_runs.MOST_STEPS", 201)
+    assert len(references_of(load_any_fmu(built))) == 4
+    monkeypatch.setattr("twodof.fmu.reference_runs.MOST_STEPS", 200)
+    with pytest.raises(FmuError, match="'rest' must be a run of at most 200 whole steps, together with those before"):
         references_of(load_any_fmu(built))

@@ -1,14 +1,17 @@
 """Reference trajectories in an FMU, with which an importer can be checked.
 
-There are two experiments of 0.5 s from the start position. In "move", the robot follows targets, or efforts of a
+There are four experiments of 0.5 s from the start position. In "move", the robot follows targets, or efforts of a
 controller. In "push", there are also external efforts, rotors, a payload that a controller knows, velocities at the
-start, accelerations of the target, and different gains of the axes. Inputs are constant over HOLD steps, and references
-are samples at which no input changes. Therefore the result does not depend on whether an importer sets inputs before or
-after it reads outputs, or interpolates them.
+start, accelerations of the target, and different gains of the axes. In "sample", the controller takes samples with
+noise, and its efforts are late. In "rest", joints have friction, stick, slip, and reach rigid stops. Inputs are
+constant over HOLD steps, and references are samples at which neither an input changes nor the controller takes a
+sample. Therefore the result does not depend on whether an importer sets inputs before or after it reads outputs, or
+interpolates them. Parameters and inputs that keep their start values are not in the files, except inputs of "push".
 
 Each sample is solved twice, by Dormand and Prince's order 8 and by Radau IIA of order 5 (Hairer, Norsett & Wanner,
-"Solving ODEs" I and II), with Pinocchio's equations of motion. Where a closed form exists it is the reference, and both
-solvers must agree with it. The format is FMI-LS-REF 1.0.0-beta.1 with MA-HS-Experiments and parameter sets of SSP 1.0.
+"Solving ODEs" I and II), with Pinocchio's equations of motion. At an event of friction or stops, which SciPy locates,
+both continue by the plant's rules. Where a closed form exists it is the reference, and both solvers must agree with it.
+The format is FMI-LS-REF 1.0.0-beta.1 with MA-HS-Experiments and parameter sets of SSP 1.0.
 """
 
 from __future__ import annotations
@@ -20,30 +23,36 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from ..errors import BuildError
-from ..plant.equations import Equations
 from ..plant.plant import Plant
 from ..plant.robot import Robot
 from ..plant.variables import OF_LINKS, ON_REQUEST, Variable
 from .closed_form import Array, responses
+from .event_solver import advanced
 from .fmi3_files import xml_text
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref"
 MANIFEST = "http://fmi-standard.org/fmi-ls-manifest"
 SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
 STEPS, STEP, HOLD = 50, 0.01, 5  # communication steps, s, steps
+PERIOD, DELAY = 3, 1  # of the sampled controller, communication steps
 ROWS = [k for k in range(1, STEPS + 1) if k % HOLD]  # samples of the references
 SWING, ACCELERATION = 0.05, 0.5  # rad or m of each joint, rad/s² or m/s²
 TIGHT = {"rtol": 1e-11, "atol": 1e-13}
 SOLVERS = {"DOP853": 1e-13, "Radau": 1e-11}  # SciPy's solvers, with their tolerances
-LEAST_TOLERANCE, MOST_TOLERANCE = 1e-10, 1e-7
+LEAST_TOLERANCE, EVENT_TOLERANCE, MOST_TOLERANCE = 1e-10, 1e-8, 1e-7
 """Tolerances relative to a variable's largest magnitude, or to 1. The first one is for the error of the FMU's
-integrator. If the solvers differ by more than the second one, there is no reference.
+integrator, the second one for that with events. If the solvers differ by more than the third one, there is no
+reference.
 """
 IDEAL: dict[str, float | bool] = {
     **dict.fromkeys(("friction", "control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), 0.0),
     **{"v_from_q": False, "limit_effort": False, **TIGHT},
 }
 """Parameters with which the motion is smooth, by group."""
+SAMPLED: dict[str, float] = {"control_period": PERIOD * STEP, "control_delay": DELAY * STEP, "seed": 7} | {
+    "q_resolution": 1e-3, "q_noise": 1e-3, "v_noise": 1e-2, "Kp": 25.0, "Kd": 10.0, "Kp_rot": 25.0, "Kd_rot": 10.0
+}  # fmt: skip
+"""Parameters and inputs of "sample", by group. The loop is stable with these gains."""
 GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau", "q_meas", "v_meas", "der_q", "der_v")
 """Groups with results in both experiments; outputs on request have results in "push"."""
 PART = 0.01  # payload and rotors of "push", relative to the robot's inertia
@@ -59,30 +68,36 @@ def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[st
     names = {v.name: v for v in table if v.group not in OF_LINKS}  # links keep their exact start values
     files: dict[str, bytes] = {}
     experiments = ET.Element("Experiments", name="references", description="Co-simulation with its reference results")
-    for name in ("move", "push"):
+    for name in ("move", "push", "sample", "rest"):
+        plant = Plant(robot, table, control)
         values = {n: IDEAL[v.group] for n, v in names.items() if v.group in IDEAL}
-        if name == "move":
-            values |= {n: 0.0 for n, v in names.items() if v.group == "damping"}
         values |= {
             n: v.start + 1e3 * (-1) ** (v.group == "q_min") for n, v in names.items() if v.group in ("q_min", "q_max")
         }
-        plant = Plant(robot, table, control)
-        for change in (values, _load(plant, names) if name == "push" else {}):
-            values |= change
-            for key, value in change.items():
-                _set(plant, names[key], value)
-            plant.initialise()
-        stimuli = _stimuli(plant, names, values, name == "push")
+        if name == "move":
+            values |= {n: 0.0 for n, v in names.items() if v.group == "damping"}
+        if name == "sample":
+            values |= {n: SAMPLED[v.group] for n, v in names.items() if v.group in SAMPLED}
+        _apply(plant, names, values)
+        if name in ("push", "rest"):
+            values |= _load(plant, names) if name == "push" else _rubbing(plant, names)
+            _apply(plant, names, values)
+        stimuli = _stimuli(plant, names, values, name)
+        if name == "rest":
+            values |= _narrowed(plant, names, stimuli)
+            _apply(plant, names, values)
         compared = (*GROUPS, *ON_REQUEST) if name == "push" else GROUPS
         found = [_solve(plant, names, compared, stimuli, method, tolerance) for method, tolerance in SOLVERS.items()]
         tolerance, exact = _tolerance(plant, stimuli, found)
         times: Array = STEP * np.arange(STEPS + 1, dtype=np.float64)
+        rows = [k for k in ROWS if name != "sample" or k % PERIOD]
+        stimuli = {n: column for n, column in stimuli.items() if name == "push" or (column != names[n].start).any()}
         files[f"{name}-in.csv"] = _csv(times, stimuli)
-        files[f"{name}-ref.csv"] = _csv(times[ROWS], {key: column[ROWS] for key, column in found[0].items()})
+        files[f"{name}-ref.csv"] = _csv(times[rows], {key: column[rows] for key, column in found[0].items()})
         texts = {
             n: str(value).lower() if isinstance(value, bool) else f"{value:.9g}"
             for n, value in values.items()
-            if n not in stimuli
+            if names[n].causality != "input" and value != names[n].start
         }
         files[f"{name}.ssv"] = parameter_set(name, ((n, names[n].type, value) for n, value in texts.items()))
         text = f"{', '.join(exact)} in closed form, the rest by" if exact else "by"
@@ -100,6 +115,12 @@ def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[st
     files["references.exp"] = xml_text(experiments)
     files["fmi-ls-manifest.xml"] = _manifest(files)
     return {f"{FOLDER}/{name}": content for name, content in files.items()}
+
+
+def _apply(plant: Plant, names: Mapping[str, Variable], values: Mapping[str, float | bool]) -> None:
+    for name, value in values.items():
+        _set(plant, names[name], value)
+    plant.initialise()
 
 
 def _set(plant: Plant, variable: Variable, value: float | bool) -> None:
@@ -125,10 +146,31 @@ def _load(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool
     }
 
 
-def _stimuli(plant: Plant, names: Mapping[str, Variable], given: Mapping[str, float | bool], push: bool) -> Columns:
+def _rubbing(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool]:
+    """Return rigid stops, and the friction of joints that have none, rounded as in the file."""
+    sizes = ACCELERATION * np.diag(plant.known.mass_matrix(np.array(plant.q)))
+    values: dict[str, float | bool] = {n: True for n, v in names.items() if v.group == "rigid_stops"}
+    of_joints = {n: v for n, v in names.items() if v.group == "friction"}
+    return values | {n: v.start or float(f"{sizes[v.index or 0]:.9g}") for n, v in of_joints.items()}
+
+
+def _narrowed(plant: Plant, names: Mapping[str, Variable], stimuli: Columns) -> dict[str, float | bool]:
+    """Return joint limits at half of the way that each joint moves without them, rounded as in the file."""
+    ways = _solve(plant, names, ["q"], stimuli, "DOP853", 1e-6)
+    ends = {"q_min": np.min, "q_max": np.max}
+    return {
+        n: float(f"{(column[0] + ends[v.group](column)) / 2.0 + 1e-3 * SWING * (-1) ** (v.group == 'q_min'):.9g}")
+        for n, v in names.items()
+        if v.group in ends
+        for column in [ways[f"q[{(v.index or 0) + 1}]"]]
+    }
+
+
+def _stimuli(plant: Plant, names: Mapping[str, Variable], given: Mapping[str, float | bool], kind: str) -> Columns:
     """Return the inputs at each communication point, STEPS + 1 values each, rounded as in the file."""
-    n, q, blocks = len(plant.q), np.array(plant.q), STEPS // HOLD
-    swing, x = SWING * (-1.0) ** np.arange(n), np.array(plant.x)
+    n, q, blocks, push = len(plant.q), np.array(plant.q), STEPS // HOLD, kind == "push"
+    size = 0.1 if kind == "rest" else 1.0  # friction holds the joints that only the controller moves
+    swing, x = size * SWING * (-1.0) ** np.arange(n), np.array(plant.x)
     plant.q = [*(q + swing)]
     reach = np.array(plant.x) - x
     plant.q = [*q]
@@ -140,7 +182,7 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], given: Mapping[str, fl
         "xd_des": moves * reach,
         "q_des": q + ramp * swing,
         "v_des": moves * swing,
-        "tau_cmd": plant.known.inverse_dynamics(q, 0.0 * q, 0.0 * q) + ACCELERATION * np.cos(phase) @ mass,
+        "tau_cmd": plant.known.inverse_dynamics(q, 0.0 * q, 0.0 * q) + size * ACCELERATION * np.cos(phase) @ mass,
     }
     if push:
         J = np.array(plant.known.observe(q, 0.0 * q)[1][:3])
@@ -149,6 +191,9 @@ def _stimuli(plant: Plant, names: Mapping[str, Variable], given: Mapping[str, fl
         inputs["f_ext"] = ACCELERATION / mobility * np.cos(phase[:, :1] + np.arange(3))
         inputs["a_des"] = PART * ACCELERATION * np.sin(phase)
         inputs["xdd_des"] = inputs["alpha_des"] = PART * ACCELERATION * np.sin(phase[:, :1] + np.arange(3))
+    if kind == "rest":  # forth, free, back, free
+        turns = np.array([1.0, 0.0, -1.0, 0.0])[(block + np.arange(n)) // 2 % 4]
+        inputs["tau_ext"] = turns * (ACCELERATION * np.diag(mass) + 2.0 * np.array(plant.friction))
     columns = {}
     for name, variable in names.items():
         if variable.causality == "input":
@@ -165,31 +210,25 @@ def _solve(
     plant: Plant, names: Mapping[str, Variable], groups: Sequence[str], stimuli: Columns, method: str, tolerance: float
 ) -> Columns:
     """Return groups of outputs at each communication point by one solver, with inputs held over each step."""
-    from scipy.integrate import solve_ivp  # which takes 0.4 s to import, and most builds have no references
-
-    n, rank = len(plant.q), -1
-    plant.q, plant.v = list(plant.q_start), list(plant.v_start)
+    rank, plant.time = -1, 0.0
+    plant.initialise()
     outputs = [v for v in names.values() if v.group in groups]
     rows = np.empty((STEPS + 1, len(outputs)))
     for k in range(STEPS + 1):
-        vectors = {
-            group: getattr(plant, group.removesuffix("_meas")) for group in {variable.group for variable in outputs}
-        }
+        plant.time = k * STEP
+        vectors = {group: getattr(plant, group) for group in {variable.group for variable in outputs}}
         rows[k] = [vectors[variable.group][variable.index] for variable in outputs]
         for name, column in stimuli.items():
             _set(plant, names[name], float(column[k]))
+        if plant.control_period:
+            plant.sampling = plant.sampling.settled(plant, plant.time)
         equations = plant.equations_of_motion()
         kept = sum(ratio > equations.rcond for ratio in equations.ratios(np.array(plant.q)))
         if rank not in (-1, kept):
             raise BuildError("no references: the robot passes a singular pose near its start; choose another `q_start`")
         rank = kept
-
-        def rates(t: float, y: Array, equations: Equations = equations) -> Array:
-            return np.concatenate([y[n:], equations.acceleration(y[:n], y[n:], None, [0] * n)[0]])
-
-        start = np.array([*plant.q, *plant.v])
-        end = solve_ivp(rates, (0.0, STEP), start, method=method, rtol=tolerance, atol=1e-14).y[:, -1]
-        plant.q, plant.v = end[:n].tolist(), end[n:].tolist()
+        end = advanced(plant, STEP, method, tolerance)
+        plant.q, plant.v = end[: len(plant.q)].tolist(), end[len(plant.q) :].tolist()
     return {variable.name: column for variable, column in zip(outputs, rows.T)}
 
 
@@ -203,7 +242,8 @@ def _tolerance(plant: Plant, stimuli: Columns, found: Sequence[Columns]) -> tupl
     worst = max(apart, key=lambda name: apart[name])
     if not apart[worst] <= MOST_TOLERANCE:
         raise BuildError(f"no references: solvers and closed form differ by {apart[worst]:.2g} in {worst}")
-    return max(LEAST_TOLERANCE, 10.0 * apart[worst]), [*exact]
+    least = EVENT_TOLERANCE if any(plant.friction) else LEAST_TOLERANCE
+    return max(least, 10.0 * apart[worst]), [*exact]
 
 
 def _closed_form(plant: Plant, stimuli: Columns, solved: Columns) -> Columns:
@@ -214,7 +254,8 @@ def _closed_form(plant: Plant, stimuli: Columns, solved: Columns) -> Columns:
     rows = len(plant.robot.axes) + 3 * (plant.control == "pose")
     full = rows <= len(plant.q) and min(equations.ratios(np.array(plant.q)), default=1.0) > equations.rcond
     pushed = any(column.any() for name, column in stimuli.items() if name.startswith(("tau_ext", "f_ext")))
-    if any(plant.damping) or pushed or not (full or group == "q") or (plant.payload and not plant.payload_known):
+    rough = plant.control_period or any(plant.damping) or any(plant.friction)
+    if rough or pushed or not (full or group == "q") or (plant.payload and not plant.payload_known):
         return {}
     columns: Columns = {}
     for name in names:
