@@ -231,7 +231,7 @@ def test_the_verdict_names_the_settings_by_which_a_controller_knows_the_payload(
 def test_a_payload_that_only_the_controller_has_is_named(ssp: Path) -> None:
     settings: dict[str, Any] = {"plant.payload": 0.0, "controller.payload": 1.0, "controller.payload_known": True}
     head = twodof.simulate(ssp, settings=settings).verdict.lines[0]
-    assert "assumes a payload of 1 kg, which the plant has not (without it: " in head
+    assert "assumes a payload of 1 kg, which the plant does not have (without it: " in head
     assert head.endswith("; set controller.payload=0")
     cured = twodof.simulate(ssp, settings={**settings, "controller.payload": 0.0}).verdict
     assert cured.outcome == "reached" and not cured.causes

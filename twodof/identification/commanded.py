@@ -63,7 +63,7 @@ def commanded_efforts(recording: Recording) -> Array:
                     _set(plant, given, recording.schedule[last][1])
                 tau[side, k, order] = plant.commanded_effort(q[k], v[k])
     except (KeyError, TypeError, ValueError, DiscardError, RobotError) as error:
-        raise InputError(f"'{name}' has no efforts, and its run.json does not tell them: {error}") from error
+        raise InputError(f"'{name}' has no efforts, and its run.json does not determine them: {error}") from error
     mean: Array = 0.5 * (tau[0] + tau[1])
     return mean
 

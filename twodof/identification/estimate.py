@@ -225,10 +225,10 @@ def _suspects(
 ) -> tuple[tuple[Suspect, ...], Array]:
     """Return the errors that whitened residuals r show, most probable first, and the covariance that they add.
 
-    J is the Jacobian of r, and N the covariance of the coordinates. Of an error's derivatives e, the coordinates
-    replace J N Jᵀ e, and e⟂ is the rest. Without the error (e⟂ᵀ r)²/|e⟂|² is χ²(1); with it, its size is −e⟂ᵀ r/|e⟂|²,
-    and the estimate is wrong by N Jᵀ e times this size. Source of this score test: Rao, "Large sample tests of
-    statistical hypotheses", Proc. Camb. Phil. Soc. 44, 1948.
+    J is the Jacobian of r, and N the covariance of the coordinates. The coordinates replace the part J N Jᵀ e of an
+    error's derivatives e, and e⟂ is the rest. Without the error (e⟂ᵀ r)²/|e⟂|² is χ²(1); with it, its size is
+    −e⟂ᵀ r/|e⟂|², and the estimate is wrong by N Jᵀ e times this size. Source of this score test: Rao, "Large sample
+    tests of statistical hypotheses", Proc. Camb. Phil. Soc. 44, 1948.
     """
     more, x, new = parameters.with_errors(z[:-1])
     dynamics = parameters.dynamics(parameters.values(z[:-1]))

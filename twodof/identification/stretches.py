@@ -146,8 +146,8 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
 def _unwrapped(recording: Recording, robot: Robot, q: Array) -> Array:
     """Return positions in which joints without limits have no jumps of a turn; some encoders wrap at ±π.
 
-    Such positions stay within a turn, and a step is a wrap if without a turn it is within a tenth of a turn of what the
-    speed of the step before it gives.
+    Such positions stay within a turn. A step is a wrap if, without a turn, it is within a tenth of a turn of the step
+    before it, at equal speed.
 
     Raises:
         InputError: a joint with limits jumps by a turn.
@@ -199,7 +199,7 @@ def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
             k = int(np.argmax(alone[:, i] * np.abs(steps[:, i])))
             raise InputError(
                 f"the position of joint '{joint}' in '{recording.path}' jumps by {steps[k, i]:.3g} at"
-                f" {recording.t[k + 1]:.4g} s: was its encoder set anew, or are there two recordings?"
+                f" {recording.t[k + 1]:.4g} s: was its encoder reset, or are there two recordings?"
             )
 
 

@@ -3,9 +3,9 @@
     M q̈_cmd + h_known − s = τ,    q̈_cmd = J⁺ (a − J̇ v + Kn J v) − Kn v,    a = Kp e + Kd (ẋ_des − J v) + ẍ_des
     id(q̈) = τ + tau_ext + Jᵀ f_ext − D v + r
 
-id is the inverse dynamics of the robot with its payload, id_known that of the controller's model, s the effort by which
-a motor falls short, and r the reactions of friction and of stops. Without τ, and solved for e, there is one term for
-each force and one for the motion:
+id is the inverse dynamics of the robot with its payload, and id_known that of the controller's model. s is the effort
+that a saturated motor lacks, and r are the reactions of friction and of stops. Elimination of τ gives e as a sum of one
+term for each force and one for the motion:
 
     e = Kp⁻¹ ((J q̈ + J̇ v + Kd J v) − Kd ẋ_des − ẍ_des + (I − J J⁺) (a − J̇ v)
               + J M⁻¹ (id(q̈) − id_known(q̈) − tau_ext − Jᵀ f_ext + D v − r + s))

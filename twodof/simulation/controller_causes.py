@@ -86,7 +86,7 @@ def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
         text = f"the controller does not know the payload of {payload:g} kg; {remedy}"
         yield Cause("load", text, share, subject="payload")
     elif believed and not payload:
-        text = f"the controller assumes a payload of {believed:g} kg, which the plant has not; set {own}payload=0"
+        text = f"the controller assumes a payload of {believed:g} kg, which the plant does not have; set {own}payload=0"
         yield Cause("load", text, _share(judge, believed * GRAVITY * LEVER), subject="payload")
     for name in ("gravity", "payload_com", "armature"):
         real, model = judge.given(name), judge.given(own + name)

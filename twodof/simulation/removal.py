@@ -30,8 +30,8 @@ def by_removal(
     """Return the causes of a failed run, that without which the run has the smallest errors first.
 
     Causes have the errors of the run without them. One that changes nothing is left out, and one that reduces the
-    error is noted; but if no cause alone changes anything, they keep their order. What keeps an error in the run
-    without the first cause follows.
+    error is noted; but if no cause alone changes anything, they keep their order. Causes that
+    keep an error in the run without the first one follow.
 
     Args:
         missed: outputs that are not at their targets.

@@ -41,7 +41,7 @@ def lines_of(
         but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
         head += f"{but}{causes[0].text}"
     elif outcome.startswith("not"):
-        head += "; no cause is seen in the samples"
+        head += "; no cause is found in the samples"
     also = [f"also {cause.text}" for cause in causes[1:] if not cause.noted]
     notes = [f"note: {cause.text}" for cause in causes if cause.noted and why[0].kind not in RUNAWAY]
     settings = _settings(judge) if outcome.startswith("not") else ""
