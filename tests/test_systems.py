@@ -243,6 +243,38 @@ def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp
         np.testing.assert_array_equal(q_of(path), expected)
 
 
+def test_a_system_in_the_form_of_libcosim_ecos_and_omsimulator_runs(plant: bytes, tmp_path: Path) -> None:
+    """Names with dots, a later start, a stated implementation, and a map of version 2.0 with a target that is none."""
+    names = {'name="tau[': 'name="p_Crane.e[', 'name="Kp"': 'name="C.kP"'}
+    component_of_others = component("pd").replace(
+        "source=", 'type="application/x-fmu-sharedlibrary" implementation="CoSimulation" source='
+    )
+    entries = "".join(
+        f'<ssm:MappingEntry source="mapped_k" target="pd.{target}"><ssc:LinearTransformation factor="{factor}"'
+        f' offset="{offset}"/></ssm:MappingEntry>'
+        for target, factor, offset in (("C.kP", 4, 0.02), ("Kd", 0.5, 0.0), ("foo", 1, 0.0))
+    )
+    entries += "".join(f'<ssm:MappingEntry source="goal{i}" target="pd.q_des[{i}]"/>' for i in (1, 2))
+    given = binding(
+        mapping='<ssd:ParameterMapping source="resources/map.ssm"/>', attributes='source="resources/set.ssv"'
+    )
+    step = '<ssc:Annotation type="com.opensimulationplatform"><osp:Step xmlns:osp="osp" size="1e-4"/></ssc:Annotation>'
+    default = f'<ssd:DefaultExperiment startTime="10"><ssd:Annotations>{step}</ssd:Annotations></ssd:DefaultExperiment>'
+    wires = WIRES.replace('startConnector="tau[', 'startConnector="p_Crane.e[')
+    elements = f"<ssd:Elements>{component_of_others}{component('plant')}</ssd:Elements>"
+    files = {
+        "resources/set.ssv": values("mapped_k Real 0.02", "goal1 Real 0.3", "goal2 Real 0.2"),
+        "resources/map.ssm": f'<ssm:ParameterMapping {NAMESPACES} version="1.0">{entries}</ssm:ParameterMapping>',
+    }
+    texts = {name: text.replace('version="1.0"', 'version="2.0"').encode() for name, text in files.items()}
+    structure = ssd(f"{given}{elements}<ssd:Connections>{wires}</ssd:Connections>", default)
+    system = loop(tmp_path / "loop.ssp", plant, pd_fmu(replaced=names), structure, **texts)
+    samples = [*twodof.samples(system, step=H, stop_time=10.0 + N * H)]
+    assert samples[0].t == 10.0
+    expected = by_hand(plant, tmp_path / "plant.fmu")
+    np.testing.assert_allclose([sample.q for sample in samples], expected, rtol=0, atol=1e-12)
+
+
 def test_a_robot_in_other_units_than_those_of_a_bag_is_refused(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     with zipfile.ZipFile(io.BytesIO(plant)) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
@@ -706,6 +738,24 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
     far = 'source="file:///etc/passwd"'
     yield "far", ssd(wired.replace('source="resources/pd.fmu"', far)), {}, "is not a file in it"
     yield "up", ssd(wired.replace("resources/pd.fmu", "../pd.fmu")), {}, "is not a file in it"
+    proxy = "proxyfmu://localhost?file=resources/pd.fmu"
+    yield "proxy", ssd(wired.replace("resources/pd.fmu", proxy)), {}, r"'proxyfmu://.*' of 'pd' is not a file in it"
+    dictionary = '<ssb:SignalDictionary xmlns:ssb="http://ssp-standard.org/SSP1/SystemStructureSignalDictionary" '
+    entry = '<ssb:DictionaryEntry name="speed"><ssc:Real/></ssb:DictionaryEntry>'
+    bus = f'{dictionary}version="1.0">{entry}</ssb:SignalDictionary>'
+    bus = f'<ssd:SignalDictionary name="bus">{bus}</ssd:SignalDictionary>'
+    bus = f"{wired}<ssd:SignalDictionaries>{bus}</ssd:SignalDictionaries>"
+    yield "dictionary", ssd(bus), {}, "system 'of all' has signal dictionaries: not supported"
+    own = binding(attributes='source="set.ssv" sourceBase="component"')
+    parts = wired.replace(component("pd"), component("pd", own))
+    yield "set in an FMU", ssd(parts), {}, "'pd' has a parameter file inside its FMU: not supported"
+    parts = wired.replace(component("pd"), component("pd", binding(attributes='source="set.ssv"')))
+    bare = b'<ssv:ParameterSet version="1.0" name="s"><ssv:Parameters/></ssv:ParameterSet>'
+    yield "no namespace", ssd(parts), {"set.ssv": bare}, r"set\.ssv is not valid SSP 1\.0: .* root\.$"
+    note = '<ssd:Annotations><ssc:Annotation type="x"/></ssd:Annotations>'
+    yield "order", ssd(note + wired), {}, r"Elements': This element is not expected\.$"
+    alone = ssd(f"<ssd:Elements>{component('pd')}</ssd:Elements>")
+    yield "no robot", alone, {}, r"no components with outputs q\[i\] and v\[i\] among pd"
     package = 'type="application/x-ssp-package" source='
     yield "package", ssd(wired.replace("source=", package, 1)), {}, "of type application/x-ssp-package"
     dotted, inner = (component("pd").replace('name="pd"', f'name="{name}"') for name in ("a.b", "b"))

@@ -181,8 +181,8 @@ class _File:
         try:
             lxml.etree.fromstring(content, lxml.etree.XMLParser(schema=_schema(kind)))
             return ET.fromstring(content)
-        except (lxml.etree.LxmlError, ET.ParseError) as error:
-            raise FmuError(f"'{self._path}': {name} is not valid SSP 1.0: {error!s:.300}") from error
+        except (lxml.etree.XMLSyntaxError, ET.ParseError) as error:
+            raise FmuError(f"'{self._path}': {name} is not valid SSP 1.0: {error.msg:.300}") from error
 
     def element(self, xml: ET.Element, name: str, units: dict[str, Unit]) -> Element:
         """Return a system with the elements inside it, or a component."""
