@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
+from types import UnionType
 from typing import Any
 
 from .bounds import MAX_ARCHIVE, MAX_DIRECTORY, MAX_FOLDERS_DEEP, MAX_MEMBERS, MAX_UNZIPPED
@@ -321,7 +322,7 @@ def parsed(text: bytes) -> Any:
     return json.loads(text.decode("utf-8"))
 
 
-def fits(content: Any, shape: Any) -> bool:
+def fits(content: object, shape: object) -> bool:
     """Return whether a JSON value has a given shape and only finite numbers.
 
     A shape is [x] for a list of any number of x, (x, y) for these two, {str: x} for x by any name, or a type.
@@ -329,11 +330,10 @@ def fits(content: Any, shape: Any) -> bool:
     if isinstance(shape, list):
         return isinstance(content, list) and all(fits(element, shape[0]) for element in content)
     if isinstance(shape, tuple):
-        same = isinstance(content, list) and len(content) == len(shape)
-        return same and all(map(fits, content, shape))
-    if isinstance(shape, dict):
+        return isinstance(content, list) and len(content) == len(shape) and all(map(fits, content, shape))
+    if isinstance(shape, dict) and isinstance(content, dict):
         keys = content if str in shape else shape
-        return isinstance(content, dict) and all(fits(content.get(key), shape.get(key, shape.get(str))) for key in keys)
+        return all(fits(content.get(key), shape.get(key, shape.get(str))) for key in keys)
     if shape == NUMBER:
-        return isinstance(content, shape) and abs(content) <= sys.float_info.max
-    return isinstance(content, shape)
+        return isinstance(content, NUMBER) and abs(content) <= sys.float_info.max
+    return isinstance(shape, type | UnionType) and isinstance(content, shape)

@@ -144,3 +144,10 @@ static Status unsupported(Instance *instance, const char *function)
         report(instance, ERROR, "%s is not supported by this FMU", function);
     return ERROR;
 }
+
+/* Define such a function, whose parameters begin with the instance. */
+#define UNSUPPORTED(Name, parameters)                  \
+    Status STANDARD(Name) parameters                   \
+    {                                                  \
+        return unsupported(instance, CALL_NAME(Name)); \
+    }

@@ -119,17 +119,12 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
     return status;
 }
 
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component component, const fmi2ValueReference vr[],
-                                       size_t count, const fmi2Integer order[],
-                                       const fmi2Real value[])
-{
-    (void)vr, (void)count, (void)order, (void)value;
-    return unsupported(component, "fmi2SetRealInputDerivatives");
-}
+/* Functions of features that modelDescription.xml excludes. */
+#if defined __GNUC__
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
 
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component component, const fmi2ValueReference vr[],
-                                        size_t count, const fmi2Integer order[], fmi2Real value[])
-{
-    (void)vr, (void)count, (void)order, (void)value;
-    return unsupported(component, "fmi2GetRealOutputDerivatives");
-}
+UNSUPPORTED(SetRealInputDerivatives, (fmi2Component instance, const fmi2ValueReference vr[], size_t count,
+                                      const fmi2Integer order[], const fmi2Real value[]))
+UNSUPPORTED(GetRealOutputDerivatives, (fmi2Component instance, const fmi2ValueReference vr[], size_t count,
+                                       const fmi2Integer order[], fmi2Real value[]))

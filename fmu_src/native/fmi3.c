@@ -180,11 +180,6 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
     return NULL;
 }
 
-#define UNSUPPORTED(Name, parameters)               \
-    fmi3Status fmi3##Name parameters                \
-    {                                               \
-        return unsupported(instance, "fmi3" #Name); \
-    }
 UNSUPPORTED(GetNumberOfVariableDependencies,
             (fmi3Instance instance, fmi3ValueReference valueReference, size_t *nDependencies))
 UNSUPPORTED(GetVariableDependencies,

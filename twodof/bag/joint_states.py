@@ -6,14 +6,14 @@ import struct
 from array import array
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..bounds import MAX_JOINT_STATE, MAX_NAME, MAX_ODD, MIB
 from ..errors import BagError
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
-from ..ros.messages import JOINT_STATE, store_of
+from ..ros.commands import deserialise
+from ..ros.messages import JOINT_STATE
 from .downsampling import Indices
 from .recording import Array, ReceivedTargets
 from .records import Stamps
@@ -107,7 +107,7 @@ class JointStates:
         self._odd += message.nbytes
         if self._odd > MAX_ODD:
             raise BagError(f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form")
-        state: Any = store_of(JOINT_STATE).deserialize_cdr(message.tobytes(), JOINT_STATE)
+        state = deserialise(JOINT_STATE, message.tobytes())
         frame, names = state.header.frame_id, tuple(state.name)
         parts = [state.position, state.velocity, state.effort]
         sizes = tuple(map(len, parts))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from time import time_ns
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from ..files import temporary_folder
 from ..ros.messages import JOINT_TRAJECTORY, store_of
 from ..simulation.experiments import NANOSECONDS
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Msg
 
 TOPIC = "/joint_trajectory_controller/joint_trajectory"
 Array = NDArray[np.float64]
@@ -34,7 +37,7 @@ def write_trajectory(path: Path, joints: Sequence[str], t: Array, q: Array, v: A
     store = store_of(JOINT_TRAJECTORY)
     types = store.types
 
-    def time(kind: str, seconds: float) -> Any:
+    def time(kind: str, seconds: float) -> Msg:
         return types[f"builtin_interfaces/msg/{kind}"](*divmod(round(seconds * NANOSECONDS), NANOSECONDS))
 
     point = types["trajectory_msgs/msg/JointTrajectoryPoint"]

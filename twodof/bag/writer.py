@@ -158,8 +158,8 @@ class Bag(Sink):
         """Receive the verdict, to be stored with the provenance."""
         self._verdict = verdict().facts()
 
-    def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
-        self._store.leave(exception)
+    def __exit__(self, *exception: object) -> None:
+        self._store.leave(exception[1])
 
     def open(self) -> None:
         """Add the robot's topics to the store, and its provenance to the folder."""

@@ -191,7 +191,7 @@ class _Variables(NamedTuple):
         return Type(self.variables[name].type)
 
 
-def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:
+def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, object]:
     """Return the given start values, completed by the start positions ``rest`` of the other joints."""
     settings = dict(options.settings)
     for key, given in (("gravity", options.gravity), ("q_start", options.q_start)):

@@ -9,7 +9,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import fmpy
@@ -172,13 +171,19 @@ def load_any_fmu(path: str | Path, inside: str = "") -> Fmu:
     if simulation is not None:  # FMPy expects the name of FMI 2.0
         derivatives = simulation.get("providesDirectionalDerivatives") in ("true", "1")
         description.coSimulation.providesDirectionalDerivative = derivatives
+    robot = _vendor_annotation(root)
     fmu = Fmu(
         path=path,
         description=description,
         variables=_variables(description),
         members=members,
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
-        **_vendor_annotation(root),
+        robot=robot.get("name", ""),
+        joints=tuple(joint.get("name", "") for joint in robot.iter("Joint")),
+        frame=robot.get("frame", ""),
+        root=robot.get("root", ""),
+        axes=robot.get("axes", ""),
+        control=robot.get("control", ""),
         inside=inside,
         described=len(xml),
     )
@@ -297,13 +302,8 @@ def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:
     return tuple(sorted(platforms))
 
 
-def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
-    """Return the robot's facts from the vendor annotation; empty for third-party FMUs."""
+def _vendor_annotation(root: ET.Element) -> ET.Element:
+    """Return the vendor annotation with the robot's facts; empty for third-party FMUs."""
     paths = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
     robots = (root.find(f"{path}/Robot") for path in paths)
-    robot = next((robot for robot in robots if robot is not None), ET.Element("Robot"))
-    return {
-        "robot": robot.get("name", ""),
-        "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),
-        **{key: robot.get(key, "") for key in ("frame", "root", "axes", "control")},
-    }
+    return next((robot for robot in robots if robot is not None), ET.Element("Robot"))

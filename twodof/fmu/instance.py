@@ -155,7 +155,7 @@ class Instance:
         return ()
 
     def _access(
-        self, function: Any, names: Sequence[str], values: Values | None
+        self, function: Callable[..., int], names: Sequence[str], values: Values | None
     ) -> tuple[Callable[[], Values], Values, Values, list[int], list[int]]:
         """Return a function that reads or sets the vectors of Real variables, and returns their buffer.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from ctypes import c_double, c_int, c_size_t, c_void_p
 from math import isfinite
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +47,7 @@ def advancing(instance: Instance | SystemInstance, names: Sequence[str], start: 
     return advance
 
 
-def span_of(instance: Instance) -> Any:
+def span_of(instance: Instance) -> Callable[..., int] | None:
     """Return the function `twodof_span` of an FMU's library; None without it."""
     return getattr(instance.slave.dll, "twodof_span", None)
 

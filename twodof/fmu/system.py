@@ -6,9 +6,8 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from copy import copy
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from ..bounds import MAX_DESCRIPTIONS, MAX_FILES, MAX_VARIABLES
 from ..errors import FmuError, InputError, SspError, choice
@@ -135,16 +134,15 @@ def load_system(path: Path, robot: str = "") -> System:
     digest = hashlib.sha256(structure)
     for fmu in by_source.values():
         digest.update(f"{fmu.guid} {sorted(fmu.members.items())}\0".encode())
-    own: dict[str, Any] = {each.name: getattr(fmus[chosen], each.name) for each in fields(Fmu)}
     description = copy(fmus[chosen].description)
     description.modelName, description.guid, description.defaultExperiment = title, digest.hexdigest(), times
     aliases: dict[str, str] = {}
     for name, node in places.items():
         if (full := str(node)) != name and node.element:
             aliases |= {full: name, full.rpartition("[")[0] or full: name.rpartition("[")[0] or name}
-    own |= dict(variables=variables, description=description, control="", aliases=aliases)
+    own = dict(variables=variables, description=description, control="", aliases=aliases)
     return System(
-        **own,
+        **{**vars(fmus[chosen]), **own},
         recorded=chosen,
         components=fmus,
         links=tuple(links),

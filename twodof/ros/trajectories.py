@@ -16,7 +16,7 @@ from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from math import comb, factorial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -77,8 +77,10 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
     """
     message = deserialise(JOINT_TRAJECTORY, cdr, MAX_TRAJECTORY)
     known = known_joints(message.joint_names, joints)
-    stamp = _nanoseconds(message.header.stamp) or came
-    times = [stamp + _nanoseconds(point.time_from_start) for point in message.points]
+    begun = message.header.stamp
+    stamp = begun.sec * NANOSECONDS + begun.nanosec or came
+    spans = (point.time_from_start for point in message.points)
+    times = [stamp + span.sec * NANOSECONDS + span.nanosec for span in spans]
     if not times or any(late <= early for early, late in pairwise(times)):
         raise CommandError("times", "has no points, or their times do not increase")
     if (late := (came - times[-1]) / NANOSECONDS) > 0.0:
@@ -93,10 +95,6 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
     begins, *seconds = ((t - begin) / NANOSECONDS for t in (came, *times))
     unknown_joints = tuple(name for name in message.joint_names if name not in joints)
     return Trajectory(begins, [i for i, _ in known], seconds, points, unknown_joints)
-
-
-def _nanoseconds(time: Any) -> int:
-    return int(time.sec * NANOSECONDS + time.nanosec)
 
 
 class _Path:

@@ -17,7 +17,7 @@ from ..files import temporary_folder
 from ..fmu import Fmu, opened
 from ..notebook import in_notebook
 from ..signatures import never
-from ..simulation.experiments import Experiment, experiment
+from ..simulation.experiments import Experiment, ExperimentOptions, experiment
 from ..simulation.input_values import Setting
 from ..simulation.progress import counting
 from ..version import versions
@@ -96,7 +96,7 @@ def sweep(
 
 def _job(run: Experiment, stop_time: float | None, names: tuple[str, ...], bags: Path | None) -> Job:
     end = run.time(run.steps) if stop_time is None else stop_time
-    options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
+    options: ExperimentOptions = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
     with opened(run.fmu):
         return Job(run.fmu.path.read_bytes(), run.fmu.path.name, names, options, bags)
 

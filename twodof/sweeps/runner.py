@@ -16,7 +16,7 @@ from ..errors import SimulationError
 from ..files import temporary_folder
 from ..fmu import Instance, SystemInstance, instantiate
 from ..signatures import ignore, never
-from ..simulation.experiments import Experiment, experiment
+from ..simulation.experiments import Experiment, ExperimentOptions, experiment
 from ..simulation.input_values import resolve
 from ..simulation.judge import Judge
 from ..simulation.master import simulate
@@ -50,7 +50,7 @@ class Job:
     content: bytes
     file: str
     names: tuple[str, ...]
-    options: dict[str, Any]
+    options: ExperimentOptions
     bags: Path | None
 
 
