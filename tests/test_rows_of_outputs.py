@@ -55,7 +55,7 @@ def in_each_way(
     found, made, span_of = [], list[int](), spans.span_of
 
     def watched(instance: twodof.fmu.Instance) -> Any:
-        span = span_of(instance)
+        span: Any = span_of(instance)
 
         def call(*arguments: Any) -> Any:
             made.append(1)

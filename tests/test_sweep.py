@@ -18,6 +18,7 @@ from twodof import sweep
 from twodof.cli.main import main
 from twodof.errors import SimulationError
 from twodof.fmu import Fmu
+from twodof.simulation.experiments import ExperimentOptions
 from twodof.simulation.setup import robot_of
 from twodof.simulation.stepping import judge_of
 from twodof.simulation.verdict import METRICS
@@ -56,7 +57,7 @@ def gains() -> list[tuple[float, float]]:
 @pytest.fixture(scope="module")
 def judged(native_path):
     """The metrics of the pairs, by single runs."""
-    options = {"stop_time": STOP, "step": STEP, "settings": {}}
+    options: ExperimentOptions = {"stop_time": STOP, "step": STEP, "settings": {}}
     job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)
     with Runner(job) as runner:
         rows = [runner.run((i, pair)) for i, pair in enumerate(gains())]
@@ -246,7 +247,7 @@ def test_a_runner_instantiates_once_and_repeats_bit_for_bit(native_path, monkeyp
         return instantiate(fmu)
 
     monkeypatch.setattr(runner_module, "instantiate", counted)
-    options = {"stop_time": 1.0, "step": STEP, "settings": {}}
+    options: ExperimentOptions = {"stop_time": 1.0, "step": STEP, "settings": {}}
     points = [(i, pair) for i, pair in enumerate(gains()[:5])]
     job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)
     with Runner(job) as runner:

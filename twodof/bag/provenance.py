@@ -74,7 +74,7 @@ class Provenance(TypedDict, total=False):
     urdf: str | None
     signals: list[str]
     system: dict[str, object]
-    input_changes: list[tuple[float, dict[str, Value]]]
+    input_changes: list[list[Any]]
     inputs_known_until: float
     commanders: list[object]
     verdict: dict[str, Any]

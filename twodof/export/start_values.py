@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from itertools import chain, count, takewhile
-from typing import Any, Protocol
+from typing import Protocol
 
 from ..errors import InputError, choice, nearest
 from ..plant.variables import CONTROLS, Value
@@ -34,12 +34,20 @@ MEANT = {
 """Names that people use for variables."""
 
 
+class Described(Protocol):
+    """A variable of an FMU or of a build."""
+
+    @property
+    def causality(self) -> str:
+        """The causality, as FMI has it."""
+
+
 class Variables(Protocol):
     """The variables of an FMU or of a build."""
 
     @property
-    def variables(self) -> Mapping[str, Any]:
-        """All variables by name, in order; each has a ``causality`` and a ``type``, as FMI has them."""
+    def variables(self) -> Mapping[str, Described]:
+        """All variables by name, in order."""
 
     @property
     def control(self) -> str:
@@ -61,7 +69,7 @@ def vector(variables: Mapping[str, object], group: str) -> list[str]:
     return list(takewhile(variables.__contains__, names))
 
 
-def groups_of(variables: Mapping[str, Any], causality: str) -> dict[str, list[str]]:
+def groups_of(variables: Mapping[str, Described], causality: str) -> dict[str, list[str]]:
     """Return vectors and scalars of one causality by group name."""
     groups: dict[str, list[str]] = {}
     for name, variable in variables.items():

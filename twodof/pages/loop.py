@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from threading import Condition
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
@@ -57,6 +57,14 @@ class PartialBag(Bag):
         super().write(sample._replace(stamp=sample.stamp + self._later))
 
 
+class Order(NamedTuple):
+    """A request: its name, its value as a number, and the values of a "change" by variable."""
+
+    name: str
+    number: int
+    values: dict[str, Value]
+
+
 class Loop:
     """Steps an FMU at the request of pages.
 
@@ -88,7 +96,7 @@ class Loop:
         self._recording: PartialBag | None = None
         self._changes: dict[str, Value] = {}
         self._playing = True
-        self._orders: deque[tuple[str, Any]] = deque()
+        self._orders: deque[Order] = deque()
         self._groups = [name for group in TOLD for name in fmu.vector(group)]
         self._lock = Condition()  # protects the requests and the data for updates
         self._rows: deque[list[float]] = deque(maxlen=MOST_ROWS)
@@ -125,7 +133,7 @@ class Loop:
             self._end_recording()
             self._source.close()
 
-    def tell(self, order: str, value: Any = None) -> None:
+    def tell(self, order: str, value: object = None) -> None:
         """Queue a request for execution between two steps; callable from any thread.
 
         Successive requests of one kind are merged, and the newest values win.
@@ -140,20 +148,19 @@ class Loop:
             InputError: a setting is invalid.
             ValueError: there is no such request.
         """
-        known = order in ("change", "play", "step", "reset", "record")
-        if not known or (order == "change" and not isinstance(value, Mapping)):
-            raise ValueError(order)
+        values: dict[str, Value] = {}
         with self._lock:
-            if order == "change":
-                value = resolve(self._run.fmu, value)
-                check_going_on(self._run.fmu, value, self._values)
-                self._values |= value
+            if order == "change" and isinstance(value, Mapping):
+                values = resolve(self._run.fmu, value)
+                check_going_on(self._run.fmu, values, self._values)
+                self._values |= values
             elif order in ("play", "step"):
                 self._playing = order == "play" and bool(value)
-            value = 1 if order == "step" else value
-            if self._orders and self._orders[-1][0] == order:
-                value = _joined(order, self._orders.pop()[1], value)
-            self._orders.append((order, value))
+            elif order not in ("reset", "record"):
+                raise ValueError(order)
+            newest = Order(order, int(order == "step" or bool(value)), values)
+            same = self._orders and self._orders[-1].name == order
+            self._orders.append(_joined(self._orders.pop(), newest) if same else newest)
             self._lock.notify()
 
     @property
@@ -208,16 +215,16 @@ class Loop:
         with self._lock:
             if not self._lock.wait_for(lambda: self._orders, patience):
                 return
-            order, value = self._orders.popleft()
+            order, number, values = self._orders.popleft()
         if order == "change":
-            self._change(value)
+            self._change(values)
         elif order == "step" and not self._broken:
             self.pace.restart()
-            for _ in range(value):
+            for _ in range(number):
                 self._step()
         elif order == "reset":
-            self._restart({}, self._first if value else None)
-        elif order == "record" and not value:
+            self._restart({}, self._first if number else None)
+        elif order == "record" and not number:
             self._end_recording()
         elif order == "record" and self._recording is None:
             self._record()
@@ -302,10 +309,8 @@ class Loop:
         self.pace.restart()
 
 
-def _joined(order: str, before: Any, value: Any) -> Any:
-    """Merge two successive requests of one kind."""
-    if order == "change":
-        return {**before, **value}
-    if order == "step":
-        return min(before + value, MOST_STEPS)
-    return before or value if order == "reset" else value
+def _joined(before: Order, newest: Order) -> Order:
+    """Merge two successive requests of one name."""
+    merged = {"step": min(before.number + newest.number, MOST_STEPS), "reset": before.number | newest.number}
+    number = merged.get(newest.name, newest.number)
+    return Order(newest.name, number, {**before.values, **newest.values})

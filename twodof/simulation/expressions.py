@@ -7,14 +7,16 @@ import ast
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, nearest
 
 LONGEST = 500  # characters
-OPERATORS: dict[object, Callable[..., Any]] = {
+Numbers = NDArray[np.float64 | np.bool_]
+OPERATORS: dict[object, Callable[..., Numbers]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
@@ -31,7 +33,7 @@ OPERATORS: dict[object, Callable[..., Any]] = {
     ("max", 2): np.maximum,
 }
 """Operators, and functions by name and number of arguments."""
-Values = Mapping[str, Any]
+Values = Mapping[str, ArrayLike]
 
 
 class Expression(NamedTuple):
@@ -39,7 +41,7 @@ class Expression(NamedTuple):
 
     text: str
     names: tuple[str, ...]
-    value: Callable[[Values], Any]
+    value: Callable[[Values], Numbers]
 
 
 def full_name(name: str, known: Iterable[str]) -> str:
@@ -80,14 +82,14 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
             raise InputError(f"'{text:.100}': there is not a number '{name:.50}'; {hint}")
     full = {name: full_name(name, known) for name in names}
 
-    def evaluate(values: Values) -> Any:
+    def evaluate(values: Values) -> Numbers:
         with np.errstate(all="ignore"):
             return value({name: np.asarray(values[own], dtype=np.float64) for name, own in full.items()})
 
     return Expression(text.strip(), tuple(full[name] for name in names), evaluate)
 
 
-def _compiled(node: ast.expr, names: list[str], condition: bool = False) -> Callable[[Values], Any]:
+def _compiled(node: ast.expr, names: list[str], condition: bool = False) -> Callable[[Mapping[str, Numbers]], Numbers]:
     """Return an expression as a function and collect its names; raise ValueError for any other syntax."""
     if isinstance(node, ast.Compare) != condition:
         raise ValueError
