@@ -315,6 +315,61 @@ def test_friction_and_stops_do_not_depend_on_the_communication_step(rigid):
         np.testing.assert_allclose(other, runs[0], rtol=0.0, atol=1e-7)
 
 
+def test_rigid_stops_at_default_tolerances_do_not_depend_on_the_communication_step(length):
+    """Impacts drive joints off their stops, to which some return within microseconds and leave again."""
+    urdf = chain(np.random.default_rng(2), 4)
+    for control in ("joint", "effort"):
+        native = Engine(from_urdf(urdf, "link4", "xyz", control))
+        for seed in range(length(3000, 300)):
+            plant, ends = thrown(native.model, np.random.default_rng(seed)), []
+            for h in (1e-3, 5e-2):
+                *_, (q, _) = states(native, plant, h, round(0.1 / h), python=False)
+                ends.append(q)
+            assert np.abs(ends[0] - ends[1]).max() <= 1e-4, (control, seed)
+
+
+def thrown(of: Model, rng) -> Any:
+    """A plant that moves between near limits, of which it touches some."""
+    plant: Any = of.plant()
+    n, plant.rigid_stops = 4, True
+    plant.q, span = rng.normal(0, 0.5, n), 10 ** rng.uniform(-3, 0, (2, n))
+    plant.q_min, plant.q_max = plant.q - span[0], plant.q + span[1]
+    plant.q = np.where(rng.random(n) < 0.3, plant.q_max, plant.q)
+    plant.v = rng.normal(0, 1, n) * 10 ** rng.uniform(-2, 1.3) * (rng.random(n) < 0.7)
+    plant.friction = 10 ** rng.uniform(-4, 1, n) * (rng.random(n) < rng.choice([0.0, 0.8]))
+    plant.armature = 10 ** rng.uniform(-5, -0.5, n) * (rng.random(n) < 0.5)
+    plant.gravity = rng.normal(0, 6, 3)
+    if of.control == "joint":
+        plant.q_des, plant.Kp = rng.normal(0, 1, n), 10 ** rng.uniform(0, 4, n)
+        plant.Kd = 2 * np.sqrt(plant.Kp) * rng.uniform(0, 1, n)
+    else:
+        plant.tau_cmd = rng.normal(0, 4, n)
+    return plant
+
+
+LIGHT = """<robot name="light"><link name="base"/><link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="wheel"><inertial>
+<mass value="1e-3"/><inertia ixx="1e-7" iyy="1e-7" izz="1e-7" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="0.5" effort="0" velocity="0"/></joint>
+<joint name="axle" type="revolute"><parent link="arm"/><child link="wheel"/><origin xyz="1 0 0"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="0" velocity="0"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("python", [False, True])
+@pytest.mark.parametrize("friction", [0.03, 0.3, 3.0])
+@pytest.mark.parametrize("max_step", [1e-3, 1e-2])
+def test_a_light_joint_that_an_impact_throws_rolls_to_its_rest(max_step, friction, python):
+    """A wheel goes on at the arm's velocity v when the arm hits its stop, and turns by I v²/(2F)."""
+    native = Engine(from_urdf(LIGHT, "wheel", "xyz", "effort"))
+    plant = native.model.plant()
+    plant.gravity, plant.rigid_stops, plant.max_step = [0.0] * 3, True, max_step
+    plant.q, plant.v, plant.friction = [0.45, 0.0], [20.0, 0.0], [0.0, friction]
+    *_, (q, v) = states(native, plant, 0.01, 2, python=python)
+    np.testing.assert_allclose(q, [0.5, 1e-7 * 20.0**2 / (2 * friction)], rtol=1e-9)
+    assert not v.any()
+
+
 @pytest.mark.parametrize("python", [False, True])
 @pytest.mark.parametrize("friction", [0.005, 0.2, 5.0])
 def test_a_clamped_joint_without_a_range_falls_against_its_friction(friction, python):

@@ -4,7 +4,7 @@
 #include <string.h>
 
 static const double CHATTER_TIME = 0.5, SHORT_CHATTER_TIME = 1.0 / 4096.0, FIRST_HOLD = 1.0 / 16777216.0,
-                    FIRST_RIGID_HOLD = 1.0 / 32.0, HOLD_GROWTH = 8.0, HOLD_OF_ALL = 1.0 / 512.0;
+                    FIRST_RIGID_HOLD = 1.0 / 65536.0, HOLD_GROWTH = 8.0, HOLD_OF_ALL = 1.0 / 512.0;
 
 /* End and length, s, of a hold: of joints at limits, of a joint in friction, or of the rank of J⁺. */
 typedef struct {
@@ -49,8 +49,7 @@ static void hold_for_a_while(Hold *hold, double t, double soon, double longest, 
    `passed` has the given error; the error grows with the square of the length. */
 static double bounded(double longest, const Step *step, int i, double error, double passed)
 {
-    const double *value = step->plant->value;
-    const double tolerance = value[ATOL] + value[RTOL] * fabs(step->y[i]);
+    const double tolerance = tolerance_of(step->plant, step->y[i]);
     return error > 0.0 ? fmin(longest, passed * sqrt(tolerance / error)) : longest;
 }
 
@@ -125,9 +124,9 @@ static void find_chatter(AntiChatter *chatter, const Step *step, const Event *ev
     for (int i = 0; i < N_JOINTS; i++) {
         const double passed = t - chatter->left[i], speed = fabs(step->y[N_JOINTS + i]);
         double hold = chatter->chatter_time;
-        if (event->stopped[i] && passed < hold && !chatter->rigid)
+        if (event->stopped[i] && passed < hold)
             hold = bounded(hold, step, i, speed * passed, passed);
-        chatter->chattering[i] = event->stopped[i] && passed < hold;
+        chatter->chattering[i] = event->stopped[i] && passed < (chatter->rigid ? chatter->chatter_time : hold);
         if (chatter->chattering[i]) {
             chatter->longest = fmin(chatter->longest, hold);
             if (!(passed < FIRST_HOLD * chatter->chatter_time)) /* rounding ends a shorter excursion */

@@ -10,7 +10,7 @@ enum { LOOKS = 4 };
 static const double DOUBT = 0.25;
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
-static const double RELEASE_RESOLUTION = 1.0 / 8192.0, FINEST_RELEASE = 1.0 / 67108864.0; /* 2⁻¹³, 2⁻²⁶ */
+static const double RELEASE_RESOLUTION = 1.0 / 1024.0, FINEST_RELEASE = 1.0 / 67108864.0; /* 2⁻¹⁰, 2⁻²⁶ */
 static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
 
 /* The event at the end of a step: joints that reached a limit, and joints that slipped and came to rest. */
@@ -100,7 +100,7 @@ static double locate(Step *step, Margin *margin, int joint, double a, double at_
 {
     const double released = fmax(RELEASE_RESOLUTION * coarseness(step->plant), FINEST_RELEASE);
     const double resolution = (margin == release_margin ? released : TIME_RESOLUTION) * step->size;
-    const double k = 0.2 / (b - a);
+    const double k = 0.01 / (b - a); /* small, because margins are smooth */
     double slack = b - a; /* how much longer the interval may be than after bisection */
     while (b - a > resolution) {
         const double middle = 0.5 * (a + b), half = 0.5 * (b - a);

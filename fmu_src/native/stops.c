@@ -78,6 +78,12 @@ INTERNAL double coarseness(const Plant *plant)
     return fmin(1.0, plant->value[RTOL] / USUAL_RTOL);
 }
 
+/* The tolerance of the error test on a position. */
+INTERNAL double tolerance_of(const Plant *plant, double q)
+{
+    return plant->value[ATOL] + plant->value[RTOL] * fabs(q);
+}
+
 /* Remove the velocity that points into a limit from the state y = (q, v). Joints in anti_chatter stop in both
    directions; without them, mutual impacts could repeat without end in finite time (Zeno), as those of the feet of a
    rocking block. Returns whether a velocity pointed into a limit. */
@@ -99,7 +105,7 @@ INTERNAL int impact(const Plant *plant, double y[N_STATES], const int anti_chatt
 }
 
 /* Stop the joints that move at y, with the accelerations a, until friction or a rigid stop ends their motion within a
-   window, s, which may be 0. Returns whether there are any. */
+   window, s, which may be 0, and within the tolerance of their positions. Returns whether there are any. */
 static int stop_within(const Plant *plant, double window, double y[N_STATES], const double a[N_JOINTS],
                        const int slip[N_JOINTS], const int kept[N_JOINTS])
 {
@@ -114,7 +120,7 @@ static int stop_within(const Plant *plant, double window, double y[N_STATES], co
         const double friction = window * plant->value[FRICTION + i];
         own->low = own->side < 0.0 ? -HUGE_VAL : friction * (slip[i] - 1); /* beyond the friction in a */
         own->high = own->side > 0.0 ? HUGE_VAL : friction * (slip[i] + 1);
-        own->there |= friction > 0.0;
+        own->there = (own->there || friction > 0.0) && 0.5 * window * fabs(v[i]) <= tolerance_of(plant, y[i]);
         own->fixed &= v[i] == 0.0 || own->side != 0.0;
         own->side = own->side == 0.0 ? slip[i] : own->side;
         rate[i] = v[i] + window * a[i];

@@ -7,7 +7,7 @@ from math import inf, sqrt
 Tolerance = Callable[[float], float]
 """Tolerance of the error test on a position, by its value."""
 CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH = 0.5, 2.0**-12, 2.0**-24, 8.0
-FIRST_RIGID_HOLD, HOLD_OF_ALL = 2.0**-5, 2.0**-9
+FIRST_RIGID_HOLD, HOLD_OF_ALL = 2.0**-16, 2.0**-9
 """Times of the anti-chatter rule. CHATTER_TIME is a fraction of the largest step, SHORT_CHATTER_TIME, FIRST_RIGID_HOLD
 and HOLD_OF_ALL are fractions of CHATTER_TIME, and FIRST_HOLD is a fraction of the longest hold. A joint that returns to
 its limit too soon is held there for FIRST_HOLD, at a rigid stop for FIRST_RIGID_HOLD. Each repetition lengthens the
@@ -16,16 +16,17 @@ HOLD_OF_ALL or longer covers all joints at limits. Without holds, an acceleratio
 each other off their limits, would release and stop joints without end. The rank of J⁺ is held in the same way if it
 drops soon after a rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded.
 
-The error of a hold bounds it for the rank (``Slide``) and for stops without reaction (``clamp_time``). In a hold of
+The error of a hold bounds it for the rank (``Slide``) and for stops (``stop_time``). In a hold of
 length τ, joint i errs by Δa_i τ²/2, where Δa is the difference of the accelerations with and without the hold. This
 must not exceed the tolerance of the error test. The last excursion, of length θ, shows Δa:
 
     rank:     Δa = |a_low − Δv/θ|      Δv is the change of velocity under the higher rank
     stop:     Δa = 2|v|/θ              return at v after a start from rest, if the acceleration falls linearly
 
-An excursion is chatter if θ is below the longest hold: its effect is then within the tolerances too. So the rule does
-not depend on the communication step, and fast motion is never held. Rounding ends an excursion from a stop that is
-shorter than FIRST_HOLD, which shows no Δa: such a hold grows only if the excursion follows the last hold at once.
+Except at rigid stops, an excursion is chatter if θ is below the longest hold: its effect is then within the tolerances
+too. So the rule does not depend on the communication step, and fast motion is never held. Rounding ends an excursion
+from a stop that is shorter than FIRST_HOLD, which shows no Δa: such a hold grows only if the excursion follows the last
+hold at once.
 
 SHORT_CHATTER_TIME applies to each joint that friction holds again at the instant of its release, or that stops within
 FIRST_HOLD of it: there, rounding decides.
@@ -80,8 +81,8 @@ class Slide(Hold):
         return passed < longest
 
 
-def clamp_time(passed: float, v: float, tolerance: float, longest: float) -> float:
-    """Return the longest hold of a joint that returns to a stop without reaction, s.
+def stop_time(passed: float, v: float, tolerance: float, longest: float) -> float:
+    """Return the longest hold of a joint that returns to a stop, s.
 
     Args:
         passed: time since the joint left its limit, s.

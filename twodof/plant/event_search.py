@@ -30,7 +30,7 @@ their range.
 """
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
-TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE = 2.0**-52, 2.0**-13, 2.0**-26
+TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE = 2.0**-52, 2.0**-10, 2.0**-26
 """Resolutions of the time of an event, as fractions of the step: of all events but a release, and the largest and the
 smallest of a release. There the acceleration is 0, so that the error of the state grows with the cube of that of the
 time.
@@ -114,7 +114,7 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, resolut
     The interpolation stays near the middle, so that it never needs many more evaluations than bisection. Source:
     Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020.
     """
-    k = 0.2 / (b - a)
+    k = 0.01 / (b - a)  # small, because margins are smooth
     slack = b - a  # how much longer the interval may be than after bisection
     while b - a > resolution:
         middle, half = 0.5 * (a + b), 0.5 * (b - a)

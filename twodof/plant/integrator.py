@@ -16,7 +16,7 @@ from .anti_chatter import (
     SHORT_CHATTER_TIME,
     Hold,
     Slide,
-    clamp_time,
+    stop_time,
 )
 from .dormand_prince import State
 from .equations import Equations
@@ -106,9 +106,9 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
             continue
         t, y, event = motion.until_event(y, rates, t, min(end, h), hold_ends=end < h and not rank_held)
         for i in event.stopped:
-            passed, tolerance = t - left[i], inf if stops.rigid else motion.tolerance(y[i])
-            hold = clamp_time(passed, y[n + i], tolerance, chatter_time)
-            if passed < hold:
+            passed = t - left[i]
+            hold = stop_time(passed, y[n + i], motion.tolerance(y[i]), chatter_time)
+            if passed < (chatter_time if stops.rigid else hold):
                 chattering[i], longest = True, min(longest, hold)
                 soon = soon if passed < FIRST_HOLD * chatter_time else max(soon, hold)
         for i in event.arrested:

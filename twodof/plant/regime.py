@@ -109,7 +109,8 @@ class Motion:
         hits = self.stops.impact(y, anti_chatter) and self.stops.rigid
         self.stops.slide(y[self.n :])
         a, self.rank, margin = self._acceleration(y, rank)
-        if hits and self.stops.stop_within(events.WINDOW * self.max_step * self.coarseness, y, a, kept):
+        window = events.WINDOW * self.max_step * self.coarseness
+        if hits and self.stops.stop_within(window, y, a, kept, self.tolerance):
             self.stops.slide(y[self.n :])
             a, self.rank, margin = self._acceleration(y, rank)
         self.grips, self.margins = [self.stops.hold(y, a, kept)], [margin]

@@ -103,7 +103,14 @@ class Stops:
             if at[i] == 0:
                 y[n + i] = 0.0
 
-    def stop_within(self, window: float, y: list[float], a: Sequence[float], kept: Sequence[bool]) -> bool:
+    def stop_within(
+        self,
+        window: float,
+        y: list[float],
+        a: Sequence[float],
+        kept: Sequence[bool],
+        tolerance: Callable[[float], float],
+    ) -> bool:
         """Stop joints whose motion friction or a rigid stop ends within a window; return whether there are any.
 
         Args:
@@ -111,12 +118,13 @@ class Stops:
             y: the state (q, v) after an impact; changed.
             a: q̈ in the directions of ``slide``.
             kept: joints at limits that stop in both directions.
+            tolerance: tolerance of a position, which the motion in the window must not exceed.
         """
         n, sides = len(self.limits), self._sides(y)
         v, rates, bounds = np.array(y[n:]), [x + window * rate for x, rate in zip(y[n:], a)], {}
         for i, friction in enumerate(self._friction):
             side, F, slip = sides.get(i, 0.0), window * friction, self.slip[i]
-            if F or side:  # bounds beyond the friction in a
+            if (F or side) and 0.5 * window * abs(v[i]) <= tolerance(y[i]):  # bounds beyond the friction in a
                 bounds[i] = -inf if side < 0.0 else F * (slip - 1), inf if side > 0.0 else F * (slip + 1)
         if not any(rates[i] * v[i] < 0.0 for i in bounds):
             return False
