@@ -36,6 +36,7 @@ MISTAKES: dict[str, str] = {
     f"{RUN} --set Kp=80 Kd=20": "'Kd=20' belongs to no option: .*--set Kd=20",
     f"{RUN} --set Kp 80": "'80' belongs to no option: .*--set Kp=80$",
     f"{RUN} --set x_des 0.2,0.1": "as in --set Kp=0.2,0.1$",
+    f"{RUN} --scene meshes": "'meshes' is one argument too many; did you mean '--meshes'",
     f"{RUN} other.fmu": "'other.fmu' is one argument too many; .*; 'twodof run --help'",
     f"{RUN} --step 10ms": "'10ms' is not a number; leave units out",
     f"{RUN} --set Kp=1_0": "--set Kp=1_0: '1_0' is not a number; write numbers as 0.2,0.1",

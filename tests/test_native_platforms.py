@@ -103,9 +103,9 @@ def canonical(tree: ET.Element) -> str:
 
 
 def fmi_functions() -> set[str]:
-    """Return the functions of FMI 2.0, and that of several steps."""
+    """Return the functions of FMI 2.0, that of several steps, and the count of evaluations."""
     header = (Path(fmpy.__file__).parent / "c-code/fmi2Functions.h").read_text()
-    return {*re.findall(r"FMI2_Export \w+TYPE +(\w+);", header), "twodof_span"}
+    return {*re.findall(r"FMI2_Export \w+TYPE +(\w+);", header), "twodof_evaluations", "twodof_span"}
 
 
 def shown(*command: object) -> str:

@@ -29,8 +29,8 @@ from twodof.simulation import stepping
 from twodof.simulation.cause import Cause
 from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
-from twodof.simulation.setup import robot_of, setup
-from twodof.simulation.verdict import judged
+from twodof.simulation.setup import robot_of, setup, setup_of
+from twodof.simulation.verdict import conclude, judged
 from twodof.simulation.verdict_text import _grouped
 
 STEP = 0.001
@@ -229,7 +229,7 @@ def test_an_orientation_that_is_held_may_move_by_a_milliradian() -> None:
 def test_a_line_names_each_joint_once() -> None:
     stands = [Cause("limit", f"joint '{name}' stood", joint=name) for name in ("a", "b", "a", "c", "b")]
     for count, others in ((4, "'b', 'c'"), (3, "all other joints")):
-        texts = [cause.text for cause in _grouped((Cause("gain", "a gain"), *stands), count)]
+        texts = [cause.text for cause in _grouped((Cause("gain", "a gain"), *stands), count, "")]
         assert texts == ["a gain", f"joint 'a' stood; likewise {others}"]
 
 
@@ -586,3 +586,80 @@ def test_a_run_of_others_with_fewer_or_more_parameters_than_joints_is_judged(tau
     zero = [cause.text for cause in verdict.causes if cause.kind == "gain"]
     assert verdict.outcome == "not reached" and "drag" not in {cause.kind for cause in verdict.causes}
     assert [text[:15] for text in zero] == ["Kp[1], Kp[3] = "][: bool(starts)]
+
+
+EXTREME = (5e-324, 1e-300, 1e154, 1e308, -1.7e308)
+
+
+@pytest.mark.parametrize("value", EXTREME)
+@pytest.mark.parametrize("name", ["q", "v", "x", "tau"])
+@pytest.mark.parametrize("count", [1, 2, 9, 300])
+@pytest.mark.filterwarnings("error")
+def test_extreme_outputs_of_a_run_have_a_verdict(name: str, value: float, count: int) -> None:
+    """A master passes any finite number to the judge."""
+    setup = setup_of(fmu := twodof.load_fmu(fmu_of("arm", "task")), robot_of(fmu.urdf), 0.01, fmu.start_values)
+    sizes = {"q": 2, "v": 2, "x": 2, "tau": 2, "quat": 0}
+    rows = {each: np.full((count, size), 0.1) for each, size in sizes.items()}
+    rows[name][:] = value * np.sin(0.7 * np.arange(count) + 1.0)[:, None]
+    judge = Judge(setup, [*sizes.values()])
+    judge.rows.write(np.hstack([*rows.values()]).tobytes())
+    verdict = conclude(judge)
+    json.dumps(verdict.facts(), allow_nan=False)
+    assert ("beyond 1e+100 at" in " ".join(verdict.lines)) == (abs(value) > 1e100)
+
+
+@pytest.mark.parametrize("name", ["Kp[1]", "f_ext[1]", "gravity[2]", "payload", "friction[2]", "x_des[1]"])
+@pytest.mark.filterwarnings("error")
+def test_a_setting_beyond_what_is_judged_is_named(name: str) -> None:
+    setup = setup_of(
+        fmu := twodof.load_fmu(fmu_of("arm", "task")), robot_of(fmu.urdf), 0.01, {**fmu.start_values, name: 1e307}
+    )
+    judge = Judge(setup, [2, 2, 2, 2, 0])
+    judge.rows.write(np.full((300, 8), 0.1).tobytes())
+    expected = (
+        "a value is beyond 1e+100 at 0 s" if name == "x_des[1]" else f"{name} = 1e+307: with a value beyond 1e+100"
+    )
+    assert expected in conclude(judge).lines[0]
+
+
+def test_times_that_repeat_have_a_verdict() -> None:
+    setup = setup_of(fmu := twodof.load_fmu(fmu_of("arm", "task")), robot_of(fmu.urdf), 0.01, fmu.start_values)
+    waves = 0.1 * np.sin(np.arange(50.0))[:, None] * np.ones((50, 2))
+    rows = {"q": waves, "v": waves, "x": waves, "tau": waves, "quat": np.empty((50, 0))}
+    verdict = judged(setup, np.zeros(50), rows, {"x": np.full((50, 2), 0.2)})
+    assert (verdict.motion, verdict.duration) == ("steady", 0.0)
+
+
+def test_percentages_add_up_to_the_whole() -> None:
+    """The load and the limit have 150 % of the error; what reduces it is on the line after them."""
+    summary = twodof.simulate(
+        fmu_of("arm", "task"), settings={"payload": 0.3, "f_ext": (0.0, 2.0, 0.0), "q_min": (-0.2, -3.0)}
+    )
+    lines = summary.verdict.lines
+    shares = [float(size) for line in lines for size in re.findall(r"\((?:[^()]*, )?([\d.]+) % of the error\)", line)]
+    reduced = [float(size) for line in lines for size in re.findall(r"reduces the error by ([\d.]+) %", line)]
+    rest = [float(size) for line in lines for size in re.findall(r"^everything else: ([\d.]+) %", line)]
+    assert len(shares) >= 1 and sum(shares) + sum(rest) - sum(reduced) == pytest.approx(100.0, abs=3.0), lines
+
+
+def test_an_arm_that_never_moved_and_an_error_that_grew_are_named() -> None:
+    held = twodof.simulate(fmu_of("arm", "joint"), settings={"q_des": (0.6, 0.4), "friction": 9.0}).verdict
+    assert "no joint ever moved" in " ".join(held.lines) and "holds it during the whole run" in held.lines[0]
+    pushed = twodof.simulate(fmu_of("arm", "joint"), settings={"q_des": (0.51, 0.35), "tau_ext": (-3.0, 0.0)})
+    first, last = (f"{np.hypot(0.51 - q[0], 0.35 - q[1]):.3g} rad" for q in ((0.5, 0.35), pushed.last.q))
+    assert f"the error of the joints grew from {first} to {last}" in " ".join(pushed.verdict.lines)
+
+
+def test_the_joint_with_the_largest_error_leads_its_line() -> None:
+    settings = {"q_des": (0.55, 0.8), "friction": (3.0, 2.0)}
+    first = twodof.simulate(fmu_of("arm", "joint"), settings=settings).verdict.lines[0]
+    assert re.search(r"\('joint2'\); joint 'joint2' sticks: .*; likewise 'joint1'", first), first
+
+
+def test_an_error_that_grows_under_a_load_is_not_a_matter_of_time() -> None:
+    """The arm starts at its target; with weak gains its motion under the force has not settled at the end."""
+    settings = {"Kp[3]": 0.1, "f_ext": (5.0, 0.0, 0.0), "x_des": None}
+    panda = fmu_of("panda", "task")
+    start = tuple(twodof.load_fmu(panda).start_values[f"x_des[{i}]"] for i in (1, 2, 3))
+    summary = twodof.simulate(panda, settings={**settings, "x_des": start})
+    assert summary.repeat is None and summary.verdict.causes[0].subject == "f_ext", summary.verdict

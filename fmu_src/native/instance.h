@@ -101,6 +101,7 @@ typedef struct {
     const char *name;
     double (*slope)[N_JOINTS]; /* the Jacobian: derivatives of the accelerations, for each input and state */
     int asks_several;   /* whether the last point had several directions */
+    double evaluations; /* of the equations of motion, in all steps */
     int has_clock;      /* whether the importer ticks the clock */
     int silent; /* bit mask of the log categories that are off; 0 before instantiation */
 } Instance;

@@ -18,6 +18,7 @@ typedef struct {
     } reason;
     int joint;   /* the joint that changes fastest, for the last two */
     double rate; /* the joint's rate of change, 1/s */
+    long evaluations; /* of the equations of motion, also of a step that can be done */
 } Failure;
 
 /* Values of the parameter integrator. */

@@ -126,14 +126,15 @@ static int advance_sampled(Sampling *sampling, Plant *plant, double time, double
 {
     const double period = plant->value[CONTROL_PERIOD], max_step = plant->value[MAX_STEP], end = time + h;
     double t = time;
-    long evaluations = 0;
+    long *evaluations = &failure->evaluations;
     int last = 0;
+    *evaluations = 0;
     if (STAGES * h > BUDGET * fmin(max_step, period != 0.0 ? period : HUGE_VAL)) {
         failure->reason = period != 0.0 && period < max_step ? SHORT_PERIOD : MANY_STEPS;
         return 0;
     }
     if (!are_samples(plant->value))
-        return advance_plant(plant, h, &evaluations, NULL, failure);
+        return advance_plant(plant, h, evaluations, NULL, failure);
     Sampling samples = *sampling;
     Plant draft = *plant;
     while (!last) {
@@ -143,7 +144,7 @@ static int advance_sampled(Sampling *sampling, Plant *plant, double time, double
         const double next = next_sampling_event(&samples, &draft);
         last = !(next < end - slack(&draft, end));
         const double length = last && t == time ? h : (last ? end : next) - t;
-        if (!advance_plant(&draft, length, &evaluations, NULL, failure))
+        if (!advance_plant(&draft, length, evaluations, NULL, failure))
             return 0;
         t = next;
     }

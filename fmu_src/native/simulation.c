@@ -57,7 +57,9 @@ static Status do_step(void *component, double point, double h)
     if (check_inputs(instance) != OK)
         return ERROR;
     Failure failure;
-    if (!advance_sampled(&state->sampling, &state->plant, point, h, &failure)) {
+    const int advanced = advance_sampled(&state->sampling, &state->plant, point, h, &failure);
+    instance->evaluations += (double)failure.evaluations;
+    if (!advanced) {
         state->phase = AFTER_DISCARD;
         return discard(instance, point, h, &failure);
     }

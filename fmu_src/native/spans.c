@@ -5,7 +5,7 @@
 #include <stdbool.h>
 #include <stddef.h>
 
-#include "internal.h"
+#include "instance.h"
 
 typedef struct {
     int kind; /* version of FMI; negative for doStep */
@@ -45,14 +45,20 @@ INTERNAL int made(const Prepared *call, size_t k, double t, double h)
 }
 
 #ifdef _WIN32
-__declspec(dllexport)
+#define EXPORTED __declspec(dllexport)
 #elif defined __GNUC__
-__attribute__((visibility("default")))
+#define EXPORTED __attribute__((visibility("default")))
+#else
+#define EXPORTED
 #endif
+
+/* Evaluations of the equations of motion in all steps of an instance so far: the cost of a run, on any machine. */
+EXPORTED double PREFIXED(twodof_evaluations)(const Instance *instance) { return instance->evaluations; }
+
 /* Do one step from each of the times; return the number of rows of outputs. A row that is not finite is the last one.
    failed receives the index of the call that was refused and its status; without a refusal, the index is count. */
-int PREFIXED(twodof_span)(const Prepared *calls, int count, const double *times, double h, int steps, const double *rows,
-                          size_t width, int failed[2])
+EXPORTED int PREFIXED(twodof_span)(const Prepared *calls, int count, const double *times, double h, int steps,
+                                   const double *rows, size_t width, int failed[2])
 {
     for (int k = 0; k < steps; k++) {
         for (failed[0] = 0; failed[0] < count; failed[0]++) {

@@ -164,6 +164,8 @@ def check_arguments(parser: Parser, unknown: Sequence[str]) -> None:
         parser.error(f"there is no option '{word}'{_meant(word, known) or lists}")
     if "=" in unknown[0] and "--set" in known:
         parser.error(f"'{unknown[0]}' belongs to no option: repeat --set, as in --set {unknown[0]}")
+    if f"--{word}" in known:
+        parser.error(f"'{word}' is one argument too many; did you mean '--{word}'?")
     name = f"; a name for what the command writes needs -o, as in -o {unknown[0]}" if "-o" in known else ""
     parser.error(f"'{unknown[0]}' is one argument too many{name}{lists}")
 

@@ -17,6 +17,7 @@ from .instance import Instance as Instance
 from .instance import Values as Values
 from .spans import SPAN as SPAN
 from .spans import advancing as advancing
+from .spans import evaluations_in as evaluations_in
 from .system import System as System
 from .system import load_fmu as load_fmu
 from .system_instance import SystemInstance as SystemInstance

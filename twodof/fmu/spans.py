@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from ctypes import c_double, c_int, c_size_t, c_void_p
+from functools import partial
 from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SimulationError
+from ..errors import FmuError, SimulationError
 from .instance import Instance, Part
 from .loading import Prepared
 from .system_instance import SystemInstance
@@ -50,6 +51,21 @@ def advancing(instance: Instance | SystemInstance, names: Sequence[str], start: 
 def span_of(instance: Instance) -> Callable[..., int] | None:
     """Return the function `twodof_span` of an FMU's library; None without it."""
     return getattr(instance.slave.dll, "twodof_span", None)
+
+
+def evaluations_in(instance: Instance | SystemInstance) -> Callable[[], float]:
+    """Return a function that counts the evaluations of the equations of motion in all steps of native FMUs.
+
+    Raises:
+        FmuError: an FMU does not count them.
+    """
+    counts = []
+    for part in {part for _, part, _ in instance.parts([], 0)}:
+        if (count := getattr(part.slave.dll, "twodof_evaluations", None)) is None:
+            raise FmuError(f"'{part.fmu.path}' does not count its evaluations; build it again")
+        count.restype = c_double
+        counts.append(partial(count, c_void_p(part.slave.component)))
+    return lambda: sum(count() for count in counts)
 
 
 def _refused(part: Part, status: int) -> SimulationError:

@@ -1,9 +1,11 @@
 """Errors of one output of a run from its target, in constant memory."""
 
+from collections.abc import Mapping
 from math import inf, nan
 
 import numpy as np
 
+from ..bounds import MAX_VALUE
 from .setup import Array
 
 BAND = 0.02
@@ -46,3 +48,14 @@ def angles(quat: Array, target: Array) -> Array:
     target = target / np.linalg.norm(target, axis=-1, keepdims=True)
     apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
     return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))
+
+
+def judgeable(rows: Array, targets: Mapping[str, Array]) -> int:
+    """Return the number of samples before the first one with a value that is not finite or beyond MAX_VALUE."""
+    tables = [rows, *targets.values()]
+    if all(np.abs(table).max(initial=0.0) <= MAX_VALUE for table in tables):
+        return len(rows)
+    sound = np.logical_and.reduce(
+        [np.broadcast_to((np.abs(table) <= MAX_VALUE).all(axis=1), len(rows)) for table in tables]
+    )
+    return len(rows) if sound.all() else int(sound.argmin())

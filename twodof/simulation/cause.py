@@ -30,6 +30,8 @@ FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
 SMALL = 0.02  # part of an error below which a cause does not count
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it
 FOLLOWING = ("limit", "saturation", "singularity")  # kinds that targets out of reach and unstable loops lead to
+MOVING = ("unstable", "sampling", "damping", "time")  # kinds of errors that still move
+ROUNDING = 5e-10  # a smaller element of a printed vector is 0
 MANY_CHANGES = 12  # changes of a target beyond which it counts as moving
 
 
@@ -62,4 +64,4 @@ class Cause(NamedTuple):
 
 def point_text(values: Array) -> str:
     """Return a vector as text, without rounding errors."""
-    return f"({', '.join(f'{value:.4g}' for value in np.round(values, 9) + 0.0)})"
+    return f"({', '.join(f'{value:.4g}' for value in np.where(np.abs(values) < ROUNDING, 0.0, values))})"

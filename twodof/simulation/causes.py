@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT, GAINS
 from .aim import BAND
-from .cause import FLOOR, FOLLOWING, KINDS, MOTION, SMALL, Cause, point_text
+from .cause import FLOOR, FOLLOWING, KINDS, MOTION, MOVING, SMALL, Cause, point_text
 from .controller_causes import damping, feedforward, gains, load, sampled
 from .judge import AT_LIMIT, Judge
 from .settling_causes import late_change, slow, unsettled
@@ -23,7 +23,6 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 TURNS_ON_PURPOSE = 6.0 * pi  # rad: a joint without limits may turn this far, if it reaches its target
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
-MOVING = ("unstable", "sampling", "damping", "time")  # kinds of errors that still move
 GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
 LASTING = 0.5  # part of an error in motion below which the error does not approach 0
 TOGETHER = 2.0  # ratio of distances from which on position and orientation are out of reach only together
@@ -60,7 +59,7 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     restless = max(_weight("time", "", parts), abs(parts.get(("sampling", ""), 0.0)))
     if rests and restless > LASTING and not any(cause.kind in MOVING for cause in found):
         found += unsettled(judge, parts.get(("motion", ""), 0.0), static)
-    ranked = _by_parts(judge, found, parts) if parts else _by_kinds(judge, found) if found else []
+    ranked = _by_parts(judge, missed, found, parts) if parts else _by_kinds(judge, found) if found else []
     if not ranked:
         return ()
     root, *others = ranked[:MOST]
@@ -90,18 +89,24 @@ def _weight(kind: str, subject: str, parts: Mapping[tuple[str, str], float]) -> 
     return parts.get(("load", "damping") if kind == "drag" else (kind, subject), 0.0)
 
 
-def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, str], float]) -> list[Cause]:
+def _by_parts(
+    judge: Judge, missed: Sequence[str], found: Sequence[Cause], parts: Mapping[tuple[str, str], float]
+) -> list[Cause]:
     """Return the causes by their parts in the error, without those that are small; opposed forces are noted."""
     beyond = max((cause.part or 0.0 for cause in found if cause.kind == "reach"), default=0.0)
     limits = _weight("limit", "", parts)
     bounds = limits + _weight("singularity", "", parts)
+    loads = [_weight("load", cause.subject, parts) for cause in found if cause.kind == "load"]
+    grown = bool(missed) and all(judge.aims[name].last > judge.aims[name].first for name in missed)
+    thrown = grown and min(loads, default=0.0) <= -LASTING and max(loads) < LASTING  # no time makes an error grow
 
     def weight(cause: Cause) -> float:
         if cause.kind == "reach":
             return cause.part or 0.0
         own = _weight(cause.kind, cause.subject, parts)
-        if cause.kind == "load" and own <= -LASTING and bounds >= LASTING and abs(limits + own) < LASTING:
-            return bounds + LASTING  # it acts away from a limit now, and has brought the arm there
+        at_limit = bounds >= LASTING and abs(limits + own) < LASTING
+        if cause.kind == "load" and own <= -LASTING and (thrown or at_limit):
+            return max(bounds, _weight("time", "", parts)) + LASTING  # it has brought the arm there, and acts away now
         if cause.kind in ("unstable", "sampling"):
             net = bounds + min(0.0, parts.get(("sampling", ""), 0.0))  # a stop also balances wrong efforts
             left = net - beyond if beyond > SMALL else bounds
@@ -113,7 +118,7 @@ def _by_parts(judge: Judge, found: Sequence[Cause], parts: Mapping[tuple[str, st
 
     ranked = []
     for cause in found:
-        if cause.kind == "time" and _weight("time", "", parts) < LASTING:
+        if cause.kind == "time" and (thrown or _weight("time", "", parts) < LASTING):
             continue  # the error does not approach 0
         grows = cause.kind == "unstable" and cause.share * judge.duration > GROWN
         first, most = grows or cause.kind in ("diverged", "degrees"), weight(cause)
@@ -298,7 +303,8 @@ def _friction(judge: Judge, missed: Sequence[str], parts: Mapping[tuple[str, str
             size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
             creeps = not held and v[i] > CREEPING * judge.speed[i]
             stops = "slows it down" if creeps else "stops it short of its target"
-            text = f"{size} {f'holds it from {moved:.4g} s on' if held else stops}"
+            holds = f"holds it from {moved:.4g} s on" if moved else "holds it during the whole run"
+            text = f"{size} {holds if held else stops}"
             text += "; raise Kp" * (bool(judge.aims) and (not parts or _weight("friction", "", parts) > 0.0))
             share = 1.0 - moved / judge.duration if held else 0.0
             state = "creeps" if creeps else "sticks"

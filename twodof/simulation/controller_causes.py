@@ -304,6 +304,6 @@ def rate_of(judge: Judge, name: str) -> float:
         return 0.0
     t, size = judge.history(), np.array(judge.error_history(name))
     k = int(np.searchsorted(t, judge.changed + 0.8 * (judge.duration - judge.changed)))
-    if len(size) < 4 or k >= len(size) - 1 or not 0.0 < size[-1] < size[k] * (1.0 - 1e-6):
+    if len(size) < 4 or k >= len(size) - 1 or not t[-1] > t[k] or not 0.0 < size[-1] < size[k] * (1.0 - 1e-6):
         return 0.0
     return log(size[k] / size[-1]) / (t[-1] - t[k]) if (np.diff(size[k:]) < 0.0).all() else 0.0

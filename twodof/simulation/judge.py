@@ -16,9 +16,10 @@ from math import inf, nan, sqrt
 
 import numpy as np
 
+from ..bounds import MAX_VALUE
 from ..plant.variables import EXACT as EXACT
-from .aim import BAND, SMALLEST_MOVE, Aim, errors
-from .cause import MANY_CHANGES
+from .aim import BAND, SMALLEST_MOVE, Aim, errors, judgeable
+from .cause import MANY_CHANGES, Cause
 from .setup import Array, Setup
 
 OF_THE_END = 0.1  # last fraction of a run, in which a moving target still changes and an error must stay in its band
@@ -43,6 +44,7 @@ class Judge:
         latest: last change of inputs that are no targets: time in s, and values before and after by name.
         aims: errors by output, for outputs with a target.
         targets: present targets by output, 1 × values.
+        lost: a value that is not finite, or beyond MAX_VALUE, as a cause; samples from it on are ignored.
         effort, speed: largest magnitude for each joint, n values; the following attributes also have n values.
         chatter: sum of the squares of the effort's changes between samples.
         saturated, low, high: number of samples at the effort limit, and after the first one at a position limit.
@@ -61,6 +63,7 @@ class Judge:
         self.saturated, self.low, self.high = np.zeros(n, int), np.zeros(n, int), np.zeros(n, int)
         self.moved, self.travel = np.full(n, -inf), 0.0
         self.first, self.last = np.empty(0), np.empty(0)
+        self.lost: tuple[Cause, ...] = ()
         self._ends = np.cumsum([0, *sizes])
         self._names = [name for name, size in zip(OUTPUTS, sizes) if size]
         self._targets: dict[str, Array] = {}
@@ -137,6 +140,14 @@ class Judge:
             rows: all OUTPUTS side by side, N × values.
             targets: targets in effect up to each sample, by output: N rows, or one row for all.
         """
+        end = 0 if self.lost else judgeable(rows, targets)
+        if end < len(rows) and not self.lost:
+            what = f"beyond {MAX_VALUE:g}" if np.isfinite(rows[end]).all() else "not finite"
+            self.lost = (Cause("diverged", f"a value is {what} at {t[end]:.4g} s", time=float(t[end])),)
+        if not end:
+            return
+        if end < len(rows):
+            t, rows, targets = t[:end], rows[:end], {name: target[:end] for name, target in targets.items()}
         rows = np.asfortranarray(rows)
         own = {name: rows[:, a:b] for name, a, b in zip(OUTPUTS, self._ends, self._ends[1:])}
         if not self.count:

@@ -79,7 +79,7 @@ def motion_of(t: Array, signals: Array, scale: float) -> tuple[str, Ringing | No
         signals: N × s errors or positions.
         scale: length of the motion, in the signals' unit.
     """
-    if len(t) < 8:
+    if len(t) < 8 or not t[-1] > t[0]:
         return "steady", None, 0
     even = np.linspace(t[0], t[-1], len(t))
     if np.abs(t - even).max() > UNEVEN * (t[-1] - t[0]):  # a bag with gaps, or a downsampled one

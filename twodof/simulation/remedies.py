@@ -15,7 +15,7 @@ from .setup import OF_THE_CONTROLLER, Array
 
 LONGER = 10.0  # a run is repeated for at most this many times its duration more
 TURN = 6.0  # rad: larger joint targets, and whole numbers, are in degrees, if one is
-STIFFER = 10.0  # factor of Kp of a run that tries the advice to raise it
+STIFFER = 10.0  # factor of Kp of a run that tries the advice to raise it, and divisor of one to lower it
 USUAL = {name: start for name, *_, start, _ in ROWS if isinstance(start, float)}
 SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
 
@@ -116,9 +116,9 @@ def _raised(judge: Judge) -> dict[str, float]:
     return raised
 
 
-def stiffer(judge: Judge) -> Repetition:
-    """Return the run with STIFFER times its gains Kp at the same damping ratio."""
-    factors = {group: factor for pair in GAINS for group, factor in zip(pair, (STIFFER, sqrt(STIFFER)))}
+def stiffer(judge: Judge, times: float) -> Repetition:
+    """Return the run with some times its gains Kp at the same damping ratio."""
+    factors = {group: factor for pair in GAINS for group, factor in zip(pair, (times, sqrt(times)))}
     values = {group: factor * gain for group, factor in factors.items() if (gain := judge.given(group)).size}
     settings = {f"{group}[{i + 1}]": float(x) for group, value in values.items() for i, x in enumerate(value)}
     return Repetition(f"with {named(values)}", tuple(settings.items()))

@@ -1,6 +1,5 @@
 """Order of the causes of a failed run, by the errors of repeated runs without each of them."""
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from math import inf, isfinite
 
@@ -9,29 +8,29 @@ import numpy as np
 from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
 from .controller_causes import damping, feedforward, load
 from .judge import OF_THE_END, Judge
-from .remedies import SAMPLING, Repetition, named, stiffer, unusual, without
-from .verdict_text import unit_of_error, worst_joint
+from .remedies import SAMPLING, STIFFER, Repetition, named, stiffer, unusual, without
+from .verdict_text import ADVICE, NEXT, dropped, unit_of_error, worst_joint
 
 LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
 HALF = 0.5  # part of the error; if no cause removes as much, all other settings are tried
 WHOLE = 0.9  # part of the error whose removal explains all consequences
-ADVICE = re.compile("; raise Kp(?=$|;)")
 
 
-Repeat = Callable[[Sequence[Repetition]], Sequence[Judge | None]]
-"""A function that runs an experiment again for each argument; a judge is None if its run failed or is too long."""
+Repeat = Callable[[Sequence[Repetition]], Sequence[Judge | str]]
+"""A function that runs an experiment again for each argument; a text is the reason why a run has no judge, or ""."""
 CausesOf = Callable[[Judge], Sequence[Cause]]
 """A function that returns the causes of a repeated run."""
 
 
 def by_removal(
     judge: Judge, missed: Sequence[str], why: Sequence[Cause], repeat: Repeat, causes_of: CausesOf
-) -> tuple[Cause, ...]:
+) -> tuple[tuple[Cause, ...], str]:
     """Return the causes of a failed run, that without which the run has the smallest errors first.
 
     Causes have the errors of the run without them. One that changes nothing is left out, and one that reduces the
     error is noted; but if no cause alone changes anything, they keep their order. Causes that
-    keep an error in the run without the first one follow.
+    keep an error in the run without the first one follow. The second result has the errors of the
+    run without all causes in words, or is "".
 
     Args:
         missed: outputs that are not at their targets.
@@ -57,20 +56,21 @@ def by_removal(
         ]
         tried = sorted(counted, key=lambda cause: _rank(cause, max(0.0, 1.0 - most)))
     elif both := next((some for some in (tried, tried + others) if trials.without_all(some) >= LITTLE), None):
-        tried = [c._replace(noted=_is_beyond(c, both) or (c.noted and not c.tried)) for c in both]  # they act together
+        tried = [
+            c._replace(noted=_is_beyond(c, both) or (c.noted and c.removes is None)) for c in both
+        ]  # they act together
         tried.sort(key=lambda cause: _rank(cause, 0.0))
     root = trials.result(tried[0]) if tried else None
     if root is None:
-        return tuple(tried)
+        return tuple(tried), ""
     left = {(c.kind, c.joint, c.subject): c for c in causes_of(root) if not c.noted}
     known = [(cause.kind, cause.joint, cause.subject) for cause in tried]
     tried = [
         c._replace(noted=c.noted and (key not in left or _is_beyond(c, tried))) for c, key in zip(tried, known)
     ]  # it acts without the first
     rest = [cause for key, cause in left.items() if key not in known]
-    rest = [cause._replace(text=f"without the first cause: {cause.text}", part=None) for cause in rest[:1]]
-    first, *others = trials.together(tried)
-    return trials.advised(first), *others, *rest
+    rest = [cause._replace(text=f"{NEXT}: {ADVICE.sub(dropped, cause.text)}", part=None) for cause in rest[:1]]
+    return (*trials.advised(tried), *rest), trials.together(tried)
 
 
 class _Trials:
@@ -80,20 +80,28 @@ class _Trials:
         self._judge, self._missed, self._repeat = judge, missed, repeat
         self._plans: dict[str, Repetition] = {}
         self._results: dict[Repetition, Judge] = {}
+        self._reasons: dict[Repetition, str] = {}  # of runs without a result
 
     def tried(self, causes: Sequence[Cause]) -> list[Cause]:
         """Return causes with the results of the runs without them, as far as there are some."""
         plans = {cause.text: plan for cause in causes if (plan := without(self._judge, cause)) is not None}
-        new = [plan for plan in dict.fromkeys(plans.values()) if plan not in self._results]
         self._plans |= plans
-        for plan, result in zip(new, self._repeat(new)):
-            if result is not None and isfinite(self._size(result)):
-                self._results[plan] = result
+        self._run([*dict.fromkeys(plans.values())])
         return [self._with_result(cause) for cause in causes]
+
+    def _run(self, plans: Sequence[Repetition]) -> None:
+        """Run plans that have no result yet."""
+        new = [plan for plan in plans if plan not in self._results and plan not in self._reasons]
+        for plan, result in zip(new, self._repeat(new)):
+            if isinstance(result, str):
+                self._reasons[plan] = result
+            elif isfinite(self._size(result)):
+                self._results[plan] = result
 
     def _with_result(self, cause: Cause) -> Cause:
         if (result := self.result(cause)) is None:
-            return cause
+            reason = self._reasons.get(self._plans[cause.text]) if cause.text in self._plans else ""
+            return cause._replace(tried=f"not tested: {reason}") if reason else cause
         tried = f"{self._plans[cause.text].words}: {self._errors(result)}"
         return cause._replace(tried=tried, removes=1.0 - self._size(result) / self._size(self._judge))
 
@@ -104,7 +112,7 @@ class _Trials:
 
     def without_all(self, tried: Sequence[Cause]) -> float:
         """Return the part of the error that the run without all causes has not."""
-        result = self._without([self._plans[cause.text] for cause in tried if cause.tried])
+        result = self._without([self._plans[cause.text] for cause in tried if cause.removes is not None])
         return 0.0 if result is None else 1.0 - self._size(result) / self._size(self._judge)
 
     def _without(self, plans: Sequence[Repetition]) -> Judge | None:
@@ -113,26 +121,31 @@ class _Trials:
             return None
         settings = dict(pair for plan in reversed(plans) for pair in plan.settings)
         whole = Repetition("", tuple(settings.items()), max(plan.longer for plan in plans))
-        if whole not in self._results and (result := self._repeat([whole])[0]) is not None:
-            self._results[whole] = result
+        self._run([whole])
         return self._results.get(whole)
 
-    def together(self, tried: list[Cause]) -> list[Cause]:
-        """Return the causes, the last of several with the errors of the run without all of them."""
-        each = [*dict.fromkeys(self._plans[cause.text] for cause in tried if cause.tried and not cause.noted)]
-        if (result := self._without(each)) is None:
-            return tried
-        words = f"; without {'both' if len(each) == 2 else 'all'}: {self._errors(result)}"
-        last = [cause.tried != "" and self._plans[cause.text] == each[-1] for cause in tried]
-        return [cause._replace(tried=cause.tried + words) if own else cause for cause, own in zip(tried, last)]
+    def together(self, tried: Sequence[Cause]) -> str:
+        """Return the errors of the run without all causes in words, if there are several."""
+        each = [*dict.fromkeys(self._plans[c.text] for c in tried if c.removes is not None and not c.noted)]
+        result = self._without(each)
+        both = "both causes" if len(each) == 2 else "all of these causes"
+        return "" if result is None else f"without {both}: {self._errors(result)}"
 
-    def advised(self, cause: Cause) -> Cause:
-        """Return a cause with the errors of a run with its advice to raise Kp; without the advice, if it is wrong."""
-        if not ADVICE.search(cause.text) or (result := self._repeat([plan := stiffer(self._judge)])[0]) is None:
-            return cause
+    def advised(self, tried: Sequence[Cause]) -> list[Cause]:
+        """Return the causes; the advice of the first one to change gains has the errors of a run with it, if it helps.
+
+        Other causes have no such advice.
+        """
+        first, *others = tried
+        plain = [cause._replace(text=ADVICE.sub(dropped, cause.text)) for cause in others]
+        if (advice := ADVICE.search(first.text)) is None:
+            return [first, *plain]
+        self._run([plan := stiffer(self._judge, STIFFER if advice[1].startswith("raise") else 1.0 / STIFFER)])
+        if (result := self._results.get(plan)) is None:
+            return [first, *plain]
+        sized = f"; {advice[1]} ({plan.words}: {self._errors(result)}){advice[2]}"
         helps = self._size(result) < HALF * self._size(self._judge)
-        advice = f"; raise Kp ({plan.words}: {self._errors(result)})" if helps else ""
-        return cause._replace(text=ADVICE.sub(lambda _: advice, cause.text))
+        return [first._replace(text=first.text.replace(advice[0], sized if helps else dropped(advice))), *plain]
 
     def _size(self, result: Judge) -> float:
         """Return the sum of the RMS errors at the end of a run, relative to the largest errors of the first one."""
@@ -162,8 +175,7 @@ class _Trials:
 def _rms(judge: Judge, name: str) -> float:
     """Return the RMS error of an output at the end of a run, m or rad."""
     late = judge.history() >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)
-    with np.errstate(over="ignore", invalid="ignore"):  # a repetition may diverge
-        return float(np.sqrt(np.mean(judge.error_history(name)[late] ** 2)))
+    return float(np.sqrt(np.mean(judge.error_history(name)[late] ** 2)))
 
 
 def _most(tried: Sequence[Cause]) -> float:

@@ -2,15 +2,14 @@
 
 import logging
 import threading
-import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import ceil
 
 from ..errors import FmuError, SimulationError
-from ..fmu import Fmu, Instance, System, SystemInstance, instantiate
+from ..fmu import Fmu, Instance, System, SystemInstance, evaluations_in, instantiate
 from ..fmu.instance import logger
 from ..signatures import ignore
 from .experiments import Experiment
@@ -20,7 +19,8 @@ from .setup import robot_of
 from .stepping import Stop, judge_of, stepped
 
 MOST_STEPS = 5000  # communication steps of a run that is repeated
-PATIENCE = 5.0  # s of wall time of all repetitions of a run
+BUDGET = 6e7  # evaluations, times joints, in all repetitions of a run: about 5 s; independent of the load of a machine
+TOO_LONG = "the run takes too long"
 
 
 def is_repeatable(run: Experiment) -> bool:
@@ -40,31 +40,38 @@ class Repeater:
 
     Attributes:
         stop: called between steps; True ends the repetitions.
-        left: wall time that they may still take, s.
+        left: evaluations of the equations of motion, times joints, that they may still take.
     """
 
     run: Experiment
     stop: Stop
-    left: float = PATIENCE
+    left: float = BUDGET
 
-    def __call__(self, plans: Sequence[Repetition]) -> list[Judge | None]:
-        """Run the experiment again for each plan; return the judges, None for a run that failed.
+    def __call__(self, plans: Sequence[Repetition]) -> list[Judge | str]:
+        """Run the experiment again for each plan; return the judges, or texts why there is none, "" for a failed run.
 
-        All are None if no time is left or ``stop`` returns true: causes with results and others are not comparable.
+        A run may take half of what is left, so that a slow one does not prevent all others. If ``stop`` returns true,
+        there are no results: causes with results and others are not comparable.
         """
-        end = time.monotonic() + self.left
-
-        def late() -> bool:
-            return time.monotonic() > end or self.stop()
-
         try:
             with instantiate(self.run.fmu) as instance, _without_messages():
-                judges = [_judged(_changed(self.run, plan), instance, late) for plan in plans]
+                count = evaluations_in(instance)
+                results = [self._limited(_changed(self.run, plan), instance, count) for plan in plans]
         except (FmuError, SimulationError):  # the file was replaced meanwhile, or an instance cannot be reset
-            return [None] * len(plans)
-        whole = not late()
-        self.left = end - time.monotonic()
-        return judges if whole else [None] * len(plans)
+            return [""] * len(plans)
+        return [""] * len(plans) if self.stop() else results
+
+    def _limited(self, run: Experiment, instance: Instance | SystemInstance, count: Callable[[], float]) -> Judge | str:
+        """Return the judge of a run, or why there is none; both depend on the run alone."""
+        before, joints = count(), len(run.fmu.joints)
+
+        def is_over() -> bool:
+            return (count() - before) * joints > self.left / 2.0
+
+        result = _judged(run, instance, lambda: is_over() or self.stop())
+        over = is_over()
+        self.left -= (count() - before) * joints
+        return TOO_LONG if over else result or ""
 
 
 def _changed(run: Experiment, plan: Repetition) -> Experiment:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from math import inf, isfinite
 from typing import Any, NamedTuple
@@ -168,13 +168,19 @@ def verdict_in(facts: Mapping[str, Any]) -> Verdict:
     return Verdict(**{**known, "numbers": numbers, "causes": found, "lines": tuple(facts["lines"])})
 
 
-def conclude(judge: Judge, known: tuple[Cause, ...] = (), repeat: Repeat | None = None) -> Verdict:
+@np.errstate(over="ignore", invalid="ignore")  # large values within MAX_VALUE; what overflows is no cause
+def conclude(judge: Judge, repeat: Repeat | None = None) -> Verdict:
     """Return the verdict of a judge's samples.
 
     Args:
-        known: causes that are known beforehand.
         repeat: function that repeats the run with other settings, if that is possible.
     """
+    judge.flush()
+    if not judge.count:
+        return Verdict(
+            "no target", "diverging", 0, 0.0, {}, judge.lost, tuple(f"no target; {c.text}" for c in judge.lost)
+        )
+    extreme = [*_extreme(judge)]
     numbers = {name: value for name, value in judge.metrics().items() if not np.isnan(value)}
     t, signals, scale = _signals(judge)
     motion, found, _ = motion_of(t, signals, scale)
@@ -183,11 +189,12 @@ def conclude(judge: Judge, known: tuple[Cause, ...] = (), repeat: Repeat | None 
     moving = judge.moving
     missed = _missed(judge)
     outcome = ("not " if missed else "") + ("followed" if moving else "reached") if judge.aims else "no target"
-    motion = "diverging" if known else motion
-    why = (*known, *causes(judge, missed, motion))
-    if repeat is not None and missed:
-        why = by_removal(judge, missed, why, repeat, _causes_of)
-    lines = lines_of(judge, outcome, motion, numbers, why)
+    motion = "diverging" if judge.lost else motion
+    why = (*judge.lost, *(extreme or causes(judge, missed, motion)))
+    together = ""
+    if repeat is not None and missed and not extreme:
+        why, together = by_removal(judge, missed, why, repeat, _causes_of)
+    lines = lines_of(judge, outcome, motion, numbers, why, together)
     return Verdict(outcome, motion, judge.count, judge.duration, numbers, why, lines)
 
 
@@ -208,21 +215,21 @@ def judged(
     """
     rows = np.hstack([values[name] for name in OUTPUTS])
     known = np.isfinite(np.hstack([*targets.values(), np.zeros((len(t), 1))])).all(axis=1)
-    finite = (np.abs(rows) <= MAX_VALUE).all(axis=1)
-    first, end = int(known.argmax()), len(t) if finite.all() else int(finite.argmin())
     judge = Judge(setup, [values[name].shape[1] for name in OUTPUTS])
     for time, inputs in changes:
         judge.note(time, inputs)
-    for k in range(first, end, BLOCK):
-        part = slice(k, min(k + BLOCK, end))
+    for k in range(int(known.argmax()), len(t), BLOCK):
+        part = slice(k, k + BLOCK)
         judge.judge(t[part], rows[part], {name: target[part] for name, target in targets.items()})
-    lost: tuple[Cause, ...] = ()
-    if not finite.all():
-        what = f"beyond {MAX_VALUE:g}" if np.isfinite(rows[end]).all() else "not finite"
-        lost = (Cause("diverged", f"a value is {what} at {t[end]:.4g} s", time=float(t[end])),)
-    if not judge.count:
-        return Verdict("no target", "diverging", 0, 0.0, {}, lost, tuple(f"no target; {cause.text}" for cause in lost))
-    return conclude(judge, lost)
+    return conclude(judge)
+
+
+def _extreme(judge: Judge) -> Iterator[Cause]:
+    """Yield a setting that is too large for the equations of the verdict, or not finite, as a cause."""
+    for name, value in judge.held.items():
+        if not name.rpartition(".")[2].startswith(("q_min[", "q_max[")) and not abs(value) <= MAX_VALUE:
+            yield Cause("diverged", f"{name} = {value:g}: with a value beyond {MAX_VALUE:g} no other cause is judged")
+            return
 
 
 def _signals(judge: Judge) -> tuple[Array, Array, float]:

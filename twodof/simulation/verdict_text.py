@@ -1,16 +1,20 @@
 """A verdict in words."""
 
+import re
 from collections.abc import Mapping
 from math import inf
 
 import numpy as np
 
 from .aim import SMALLEST_MOVE
-from .cause import FLOOR, SMALL, Cause, point_text
+from .cause import FLOOR, MOVING, SMALL, Cause, point_text
 from .controller_causes import STILL, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
 
-WHOLE = 0.995  # part of an error that is printed as the whole
+WHOLE = 0.995  # part of an error from which on parts are not printed: larger ones balance each other
+NEXT = "seen when the run is repeated without the first cause"
+ADVICE = re.compile(r"; (raise Kp|raise the gains|lower the gains)(, or |(?=$|;))")
+"""Advice without a size; a repeated run may have shown that it helps."""
 MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
 RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
@@ -31,24 +35,36 @@ CONTROLLER = {
 
 
 def lines_of(
-    judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...]
+    judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...], together: str
 ) -> tuple[str, ...]:
-    """Return the lines of a verdict; the first has the outcome and the first cause."""
+    """Return the lines of a verdict; the first has the outcome and the first cause.
+
+    Args:
+        together: errors of the run without all causes in words, or "".
+    """
     off = ", ".join(_distances(judge, numbers))
     head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
-    causes = _grouped(why, len(judge.setup.joints))
+    worst = worst_joint(judge)[1] if "final_joint_error" in numbers else ""
+    parts = _parts(why)
+    left = {**parts}  # all forces of a kind have one part, which is printed once
+    causes = [_completed(judge, cause, worst, left) for cause in _grouped(why, len(judge.setup.joints), worst)]
     if why and not why[0].noted:
         but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
         head += f"{but}{causes[0].text}"
     elif outcome.startswith("not"):
         head += "; no cause is found in the samples"
     also = [f"also {cause.text}" for cause in causes[1:] if not cause.noted]
-    notes = [f"note: {cause.text}" for cause in causes if cause.noted and why[0].kind not in RUNAWAY]
+    notes = [
+        f"note: {ADVICE.sub(dropped, cause.text)}" for cause in causes if cause.noted and why[0].kind not in RUNAWAY
+    ]
     settings = _settings(judge) if outcome.startswith("not") else ""
     lines = [
         head,
-        *also,
+        *(text for text in also if NEXT not in text),
+        together,
+        *(text for text in also if NEXT in text),
         *notes,
+        _remainder(parts),
         _response(judge, outcome, motion, numbers, why),
         _peaks(judge, why, outcome),
         settings,
@@ -56,10 +72,16 @@ def lines_of(
     return tuple(filter(None, lines))
 
 
-def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
-    """Return the worst cause of each kind with the joints, of ``count``, of its others, and all causes without one.
+def dropped(advice: re.Match[str]) -> str:
+    """Return the text that replaces advice which does not hold."""
+    return "; " if advice[2] else ""
 
-    A joint that sticks has a time, and one that creeps none.
+
+def _grouped(why: tuple[Cause, ...], count: int, worst: str) -> list[Cause]:
+    """Return one cause of each kind with the joints, of ``count``, of its others, and all causes without one.
+
+    It is that of the joint with the worst error, or else the first one. A joint that sticks has a time, and one that
+    creeps none. Errors without a cause stand beside the first cause that has them.
     """
     grouped: list[Cause] = []
     for cause in why:
@@ -68,33 +90,61 @@ def _grouped(why: tuple[Cause, ...], count: int) -> list[Cause]:
         if cause not in same:
             grouped.append(cause)
         elif cause is same[0]:
-            joints = dict.fromkeys(other.joint for other in same if other.joint != cause.joint)
+            lead = next((other for other in same if other.joint == worst), cause)
+            joints = dict.fromkeys(other.joint for other in same if other.joint != lead.joint)
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
             names = "all other joints" if len(joints) == count - 1 > 1 else names
-            grouped.append(cause._replace(text=cause.text + f"; likewise {names}" * bool(names)))
-    several = len([cause for cause in grouped if not cause.noted]) > 1
+            grouped.append(lead._replace(text=lead.text + f"; likewise {names}" * bool(names)))
     first = {cause.tried: cause for cause in reversed(grouped)}
-    return [cause._replace(text=_with_part(cause, several, first[cause.tried] is cause)) for cause in grouped]
+    return [c if not c.tried or first[c.tried] is c else c._replace(tried="", part=None) for c in grouped]
 
 
-def _with_part(cause: Cause, several: bool, new: bool) -> str:
-    """Return a cause's text, before its remedy with the errors without it, or else with its part in the error.
+def _parts(why: tuple[Cause, ...]) -> dict[str, float]:
+    """Return the parts in the error that are printed, by kind or input: of several causes, none of them the whole.
 
-    The part is only printed of one of several causes, and if it is known and less than all of the error; the errors,
-    if they are new.
+    After repetitions there are none: then the causes have errors.
     """
-    part = cause.tried if new else ""
-    if (
-        not cause.tried
-        and several
-        and cause.part is not None
-        and cause.kind != "reach"
-        and SMALL <= abs(cause.part) < WHOLE
-    ):
-        percent = f"{100.0 * abs(cause.part):.2g} %"
-        part = f"{percent} of the error" if cause.part > 0.0 else f"it reduces the error by {percent}"
+    if any(cause.tried for cause in why):
+        return {}
+    parts = {_of(cause): cause.part for cause in why if cause.part is not None and cause.kind != "reach"}
+    several = len({_of(cause) for cause in why if not cause.noted}) > 1
+    shown = {key: part for key, part in parts.items() if abs(part) >= SMALL}
+    return shown if several and max(map(abs, shown.values()), default=WHOLE) < WHOLE else {}
+
+
+def _of(cause: Cause) -> str:
+    """Return what has a part in the error: all forces of a kind, an input, or the motion."""
+    return "motion" if cause.kind in MOVING else cause.subject or cause.kind
+
+
+def _completed(judge: Judge, cause: Cause, worst: str, parts: dict[str, float]) -> Cause:
+    """Return a cause with its numbers in parentheses before its remedy.
+
+    They are the errors without it, or else its part in the error; and the error of its joint, if another one is worse.
+    """
+    facts, part = [], parts.pop(_of(cause), None) if cause.part is not None else None
+    if cause.joint and worst and cause.joint != worst and not cause.noted and cause.kind not in ("reach", "degrees"):
+        own = judge.setup.joints.index(cause.joint)
+        off = abs(judge.wanted("q")[own] - judge.end("q")[own])
+        facts.append(f"its own error is {off:.3g} {judge.setup.units[own]}".strip())
+    if cause.tried:
+        facts.append(cause.tried)
+    elif cause.part is not None and part is not None:
+        percent = f"{100.0 * abs(part):.2g} %"
+        facts.append(f"{percent} of the error" if part > 0.0 else f"it reduces the error by {percent}")
+    elif cause.part is not None and cause.part <= -SMALL and cause.noted:
+        facts.append("it reduces the error")
     text, *remedy = cause.text.split("; ", 1)
-    return "; ".join([f"{text} ({part})" if part else text, *remedy])
+    return cause._replace(text="; ".join([f"{text} ({', '.join(facts)})" if facts else text, *remedy]))
+
+
+def _remainder(parts: Mapping[str, float]) -> str:
+    """Return the part of the error that no printed percentage has, in words."""
+    rest = 1.0 - sum(parts.values())
+    if not parts or abs(rest) < SMALL:
+        return ""
+    size = f"{100.0 * abs(rest):.2g} %"
+    return f"everything else: {size} of the error" if rest > 0.0 else f"everything else reduces the error by {size}"
 
 
 def _settings(judge: Judge) -> str:
@@ -137,9 +187,14 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
         moves = {name: aim for name, aim in judge.aims.items() if aim.first >= FLOOR} or judge.aims
-        firsts = [f"{aim.first:.3g} {unit_of_error(judge, name)}" for name, aim in moves.items()]
-        late = f"not within 2 % of the initial error of {' and '.join(firsts)}"
-        late += ", farther from the target than at the start" * any(aim.last > aim.first for aim in moves.values())
+        units = {name: unit_of_error(judge, name) for name in moves}
+        grown = [
+            f"the error of the {ERRORS[name]} grew from {aim.first:.3g} {units[name]} to {aim.last:.3g} {units[name]}"
+            for name, aim in moves.items()
+            if aim.last > aim.first
+        ]
+        firsts = [f"{aim.first:.3g} {units[name]}" for name, aim in moves.items()]
+        late = ", ".join(grown) or f"not within 2 % of the initial error of {' and '.join(firsts)}"
         moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
         only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
         within = only if outcome == "not reached" else f"within 2 % after {settling:.4g} s"
@@ -159,6 +214,8 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
     if "frequency" in numbers and not {"unstable", "sampling"} & {cause.kind for cause in why[:1]}:
         grows = " with a growing amplitude" * bool(motion == "oscillating" and numbers["damping"] < 0.0)
         rings = f" at {numbers['frequency']:.4g} Hz{grows}, damping ratio {numbers['damping']:.3g}"
+    if not judge.speed.any() and outcome.startswith("not"):
+        return ", ".join([*parts, "no joint ever moved"])
     end = motion + rings if motion in ("oscillating", "diverging") else _rest(judge, outcome) or motion
     return ", ".join([*parts, f"{end} at the end"])
 
