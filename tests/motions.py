@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,14 @@ def mujoco_model(
 
 
 def move(
-    model: Any, home: Sequence[float], reach: float, seconds: float, *, seed: int = 0, fastest: float = 1.0
+    model: Any,
+    home: Sequence[float],
+    reach: float,
+    seconds: float,
+    *,
+    seed: int = 0,
+    fastest: float = 1.0,
+    hindered: Callable[[Any, Array], Array] | None = None,
 ) -> Any:
     """Positions, velocities and efforts at 100 Hz while a controller with a period of 1 ms follows sums of sines.
 
@@ -55,6 +62,7 @@ def move(
         seconds: duration.
         seed: of frequencies and phases.
         fastest: frequency, Hz.
+        hindered: as for ``follow``.
     """
     rng, n = np.random.default_rng(seed), model.nv
     omega = 2.0 * np.pi * rng.uniform(0.1, 1.0, (5, n)) * fastest
@@ -67,10 +75,16 @@ def move(
         v = ramp * (reaches * omega * np.cos(angle)).sum(axis=0)
         return q, v, -ramp * (reaches * omega**2 * np.sin(angle)).sum(axis=0)
 
-    return follow(model, target, seconds, home)
+    return follow(model, target, seconds, home, hindered)
 
 
-def follow(model: Any, target: Any, seconds: float, home: Sequence[float]) -> Any:
+def follow(
+    model: Any,
+    target: Any,
+    seconds: float,
+    home: Sequence[float],
+    hindered: Callable[[Any, Array], Array] | None = None,
+) -> Any:
     """Positions, velocities and efforts at 100 Hz while a controller with a period of 1 ms follows a target.
 
     Args:
@@ -78,6 +92,8 @@ def follow(model: Any, target: Any, seconds: float, home: Sequence[float]) -> An
         target: function of the time, s, to positions and their two derivatives.
         seconds: duration.
         home: positions at the beginning.
+        hindered: function of MuJoCo's data and of the load, the effort of the links, that returns what the robot takes
+            from the efforts, each 1 ms.
     """
     data, M, samples = mujoco.MjData(model), np.zeros((model.nv, model.nv)), []
     data.qpos[:] = home
@@ -88,7 +104,8 @@ def follow(model: Any, target: Any, seconds: float, home: Sequence[float]) -> An
         effort = M @ (a + 40.0 * (v - data.qvel) + 400.0 * (q - data.qpos)) + data.qfrc_bias
         if k % 10 == 0:
             samples.append(np.array([data.qpos, data.qvel, effort]))
-        data.qfrc_applied[:] = effort
+        load = (M - np.diag(model.dof_armature)) @ a + data.qfrc_bias
+        data.qfrc_applied[:] = effort - (hindered(data, load) if hindered else 0.0)
         mujoco.mj_step(model, data, nstep=10)
     return np.array(samples).transpose(1, 0, 2)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import tracemalloc
 from dataclasses import replace
 from itertools import count
@@ -16,11 +17,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.optimize
+import scipy.signal
 from motions import assert_true, bag_of, move, mujoco_model, noisy
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import InputError
+from twodof.identification import curves as prediction_curves
 from twodof.identification import estimate as estimation
 from twodof.identification import fitting, parameters, stretches
 from twodof.identification.estimate import Misfit, Suspect, estimate
@@ -42,9 +45,10 @@ HIDDEN: dict[str, Any] = {
 }  # fmt: skip
 
 
-def arm_motion(seed: int = 0, **changed: Any) -> Any:
+def arm_motion(seed: int = 0, seconds: float = 30.0, hindered: Any = None, **changed: Any) -> Any:
     hidden = {"payload": 0.15, "end": "EndEffector", **HIDDEN, **changed}
-    return move(mujoco_model(ARM.read_text("utf-8"), **hidden), [-0.5, 0.6], 0.8, 30.0, seed=seed, fastest=2.0)
+    model = mujoco_model(ARM.read_text("utf-8"), **hidden)
+    return move(model, [-0.5, 0.6], 0.8, seconds, seed=seed, fastest=2.0, hindered=hindered)
 
 
 @pytest.fixture(scope="module")
@@ -247,6 +251,91 @@ def test_a_small_error_of_the_model_is_named_and_widens_the_intervals(name, size
     if name != "clock":
         free = twodof.fit(ARM, bag, (*FREE, name), gravity=gravity)
         assert free.explains and "residuals are noise" in free.remarks[0]
+
+
+DRY = np.array(HIDDEN["friction"])
+DRAGS: dict[str, Any] = {
+    "speed": lambda data, load: 0.1 * DRY * data.qvel * np.abs(data.qvel),
+    "direction": lambda data, load: 0.1 * DRY,
+    "load": lambda data, load: 0.03 * np.abs(load) * np.tanh(data.qvel / 1e-3),
+}
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        ("speed", "damping of joint 'joint"),
+        ("direction", ""),
+        ("load", "friction of joint 'joint"),
+        ("bias", ""),
+        ("large bias", "efforts of joint 'joint1' that are about 0.0"),
+        ("gain", "efforts of all joints that need about +"),
+        ("filter", "efforts behind a filter with a time constant of about 2"),
+    ],
+)
+def test_an_error_of_the_model_is_named_or_can_be_a_parameter(error, words, motion, tmp_path):
+    """Values are 6 to 68 deviations off without both. A small bias, also of friction, looks like a payload."""
+    q, v, effort = arm_motion(seconds=60.0, hindered=DRAGS[error]) if error in DRAGS else motion
+    if "bias" in error:
+        effort = effort + (0.005 if error == "bias" else 0.04) * np.sqrt(np.mean(effort**2, axis=0))
+    elif error == "gain":
+        effort = effort / 1.05
+    elif error == "filter":  # of 30 ms, between samples along a line
+        decay = np.exp(-0.01 / 0.03)
+        mean = 3.0 * (1.0 - decay)
+        effort = scipy.signal.lfilter([1.0 - mean, mean - decay], [1.0, -decay], effort - effort[0], axis=0) + effort[0]
+    free = (*FREE, "bias:*") if error in ("direction", "bias") else FREE
+    result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, *noisy((q, v, effort))), free, gravity=GRAVITY)
+    assert words in str(result) and result.explains is not bool(words)
+    most = 4.0 if error == "filter" else 3.0  # the test of a filter has its effect in the second order alone
+    for p in (p for p in result.parameters if p.name in TRUTH):
+        assert abs(p.after - TRUTH[p.name]) <= most * p.deviation, (p, TRUTH[p.name])
+
+
+def test_a_constant_error_of_the_efforts_can_be_a_parameter(motion, tmp_path):
+    q, effort = noisy(motion)
+    bag = bag_of(tmp_path / "bag", JOINTS, q, effort + np.array([0.2, 0.0]))
+    result = twodof.fit(ARM, bag, (*FREE, "bias:joint1"), gravity=GRAVITY)
+    assert result.explains
+    assert_true(result, TRUTH | {"bias:joint1": 0.2})
+
+
+def test_values_that_have_not_converged_are_not_known(bag, monkeypatch, tmp_path):
+    monkeypatch.setattr(estimation, "STEPS", 1)
+    monkeypatch.setattr(estimation, "LAST_STEPS", 1)
+    result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)
+    assert not result.converged and not result.explains
+    assert not any(p.known for p in result.parameters) and str(result).count("not known") == 7
+    assert "the fit has not converged, and no value is known" in result.remarks[0]
+
+
+@pytest.mark.parametrize(("finished", "known"), [(0, None), (2, False), (8, True)])
+def test_ctrl_c_leaves_the_best_values_so_far(finished, known, bag, monkeypatch, tmp_path, capsys):
+    """The signal comes in a step of the estimation, or in the prediction after it."""
+    where, name = (estimation, "_solve") if finished < 8 else (prediction_curves, "predict")
+    own, steps = getattr(where, name), count(0 if finished < 8 else 8)
+
+    def interrupted(*arguments: Any) -> Any:
+        if next(steps) == finished:
+            signal.raise_signal(signal.SIGINT)
+        return own(*arguments)
+
+    monkeypatch.setattr(where, name, interrupted)
+    free = [word for pattern in FREE for word in ("--free", pattern)]
+    output = tmp_path / "fitted"
+    words = ["fit", str(ARM), str(bag), *free, "--gravity", *map(str, GRAVITY), "-o", str(output)]
+    assert main(words) == 130
+    printed = capsys.readouterr().out
+    assert [*tmp_path.iterdir()] == [output] * (known is not None)
+    if known is None:
+        return
+    facts = json.loads((output / "fit.json").read_text("utf-8"))
+    assert facts["interrupted"] and facts["converged"] is known
+    assert "note: the fit was interrupted: " in printed
+    assert "<b>The fit was interrupted: " in (output / "fit.html").read_text("utf-8")
+    assert {p["known"] for p in facts["parameters"]} == {known} and not facts["held_out"]["after"]
+    for p in facts["parameters"]:
+        assert p["after"] == pytest.approx(TRUTH[p["name"]], rel=0.3)
 
 
 def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:

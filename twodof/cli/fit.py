@@ -12,6 +12,7 @@ from .fmus import is_robot
 from .help import Parser
 from .options import CommandLineError, add_options, add_output, given_options, links, not_empty, parse_locks
 from .printing import plain, print_json, print_next, print_table, quote, say
+from .signals import INTERRUPTED
 
 
 def add(fit: Parser) -> None:
@@ -28,7 +29,7 @@ def add(fit: Parser) -> None:
         "--free",
         metavar="PATTERN",
         help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
-        " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
+        " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT, bias:JOINT; repeatable",
     )
     text = "without bags: write a motion of S seconds, from whose recording a fit is most precise"
     option("--design", type=float, metavar="S", help=text)
@@ -63,9 +64,10 @@ def call(options: argparse.Namespace) -> int:
             progress=progress,
             **given_options(options, "frame", "gravity"),
         )
+    status = INTERRUPTED if result.interrupted else 0
     if options.json:
         print_json(output=str(output), **result.facts)
-        return 0
+        return status
     print_table(*result.rows)
     for remark in result.remarks:
         say(f"note: {remark}")
@@ -75,7 +77,7 @@ def call(options: argparse.Namespace) -> int:
     page = output / "fit.html"
     say(f"page: {page}" if page.exists() else f"no page: {install('view')}")
     print_next(f"twodof build {quote(output / 'robot.urdf')}{same}{settings}")
-    return 0
+    return status
 
 
 def _design(options: argparse.Namespace) -> int:

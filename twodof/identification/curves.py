@@ -95,5 +95,5 @@ def efforts(robot: Robot, values: Dynamics, stretch: Stretch) -> Array:
     data = model.createData()
     states = zip((stretch.q + values.offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T)
     links = np.array([pin.rnea(model, data, *state) for state in states]) @ C
-    own = values.friction * np.sign(stretch.v) + values.damping * stretch.v + values.armature * stretch.a
+    own = values.friction * np.sign(stretch.v) + values.damping * stretch.v + values.armature * stretch.a + values.bias
     return np.asarray((links + own) / values.gain)

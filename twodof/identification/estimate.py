@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +12,8 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from ..errors import InputError
-from .parameters import SEEN, Parameters, Values
-from .regression import EDGES, Rows, jacobian, residual, rows_of, stretched
+from .parameters import SEEN, Dynamics, Parameters, Values
+from .regression import EDGES, UNMODELLED, Rows, jacobian, residual, rows_of, stretched
 from .stretches import Array, Stretch
 
 PRIOR = 3.0
@@ -34,6 +34,10 @@ SEPARATE = 1e-6
 """Part of the power of an error that the coordinates cannot replace, below which the error is not tested."""
 SIGNIFICANCE = 1e-4
 """Probability of residuals below which they are not noise."""
+ALARMS = 0.005
+"""Probability that the residuals of a right model show an error of the setup."""
+SLOW = 2
+"""Number of bins in which a filter is tested: in faster ones, the noise of accelerations looks like a filter."""
 
 
 class Misfit(NamedTuple):
@@ -86,7 +90,8 @@ class Estimate(NamedTuple):
         noise: standard deviation of the efforts' noise, N·m or N, n.
         misfits: comparison of residuals for each joint.
         suspects: errors that the residuals show, the most probable one first.
-        converged: False if the last solution still moved after its most steps.
+        converged: False if the last solution still moved after its most steps; no value is known then.
+        interrupted: True if Ctrl-C ended the estimation.
     """
 
     x: Array
@@ -99,12 +104,40 @@ class Estimate(NamedTuple):
     misfits: tuple[Misfit, ...]
     suspects: tuple[Suspect, ...]
     converged: bool
+    interrupted: bool
+
+
+class _Solution(NamedTuple):
+    """Rows, standard deviations of their noise, coordinates and delay, and the scales of these."""
+
+    rows: Sequence[Rows]
+    sd: Sequence[Array]
+    z: Array
+    scales: Array
+    converged: bool
 
 
 def estimate(
     parameters: Parameters, stretches: Sequence[Stretch], finished: Callable[[], None] = lambda: None
 ) -> Estimate:
-    """Return the most likely coordinates of the free parameters; ``finished`` is called after each of the PASSES."""
+    """Return the most likely coordinates of the free parameters; ``finished`` is called after each of the PASSES.
+
+    Ctrl-C after the first pass ends it with the last solution.
+    """
+    solutions, interrupted = _solutions(parameters, stretches), False
+    solution = next(solutions)
+    try:
+        finished()
+        for better in solutions:
+            solution = better
+            finished()
+    except KeyboardInterrupt:
+        interrupted = True
+    return _result(parameters, *solution, interrupted)
+
+
+def _solutions(parameters: Parameters, stretches: Sequence[Stretch]) -> Iterator[_Solution]:
+    """Yield a better solution after each of the PASSES."""
     x, low, scales = parameters.coordinates(typical(stretches))
     scales, low = np.append(scales, DELAY_SCALE), np.append(low, -np.inf)
     start = np.append(x, 0.0)
@@ -122,17 +155,16 @@ def estimate(
         z = solved.x
         dynamics = parameters.dynamics(parameters.values(z[:-1]))
         sd = [_deviations(each, residual(each, dynamics, float(z[-1]))) for each in rows]
-        finished()
-    shift, turn = abs(z[-1] - rows[0].about[1]), np.abs(dynamics.offset - rows[0].about[0]).max()
-    converged = bool(solved.status > 0 and shift <= LARGEST_SHIFT and turn <= LARGEST_TURN)
-    return _result(parameters, rows, sd, z, scales, converged)
+        shift, turn = abs(z[-1] - rows[0].about[1]), np.abs(dynamics.offset - rows[0].about[0]).max()
+        converged = last and solved.status > 0 and shift <= LARGEST_SHIFT and turn <= LARGEST_TURN
+        yield _Solution(rows, sd, z, scales, bool(converged))
 
 
 def typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
     """Return the friction, damping and armature that would each explain a joint's efforts without other causes."""
     rms = {name: np.sqrt(np.mean(np.concatenate([getattr(s, name) for s in stretches]) ** 2, 0)) for name in "va"}
     effort = np.sqrt(np.mean(np.concatenate([s.tau for s in stretches]) ** 2, axis=0))
-    return {"friction": effort, "damping": effort / rms["v"], "armature": effort / rms["a"]}
+    return {"friction": effort, "damping": effort / rms["v"], "armature": effort / rms["a"], "bias": effort}
 
 
 def _solve(
@@ -187,7 +219,13 @@ def _deviations(rows: Rows, errors: Array) -> Array:
 
 
 def _result(
-    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, scales: Array, converged: bool
+    parameters: Parameters,
+    rows: Sequence[Rows],
+    sd: Sequence[Array],
+    z: Array,
+    scales: Array,
+    converged: bool,
+    interrupted: bool,
 ) -> Estimate:
     J = information_root(parameters, rows, sd, z) * scales
     strengths, directions = np.linalg.eigh(J.T @ J)
@@ -200,7 +238,7 @@ def _result(
     by_prior = (spread[:, unseen] ** 2) @ variances[unseen]
     values = parameters.values(z[:-1])
     sharp = np.sqrt(total[:-1]) <= SHARP * np.abs(parameters.reported(values))
-    known = sharp | (by_prior <= PRIOR_SHARE * total)[:-1]
+    known = converged & (sharp | (by_prior <= PRIOR_SHARE * total)[:-1])
     dynamics = parameters.dynamics(values)
     shown, added = _suspects(parameters, rows, sd, z, J, directions * variances @ directions.T)
     covariance = spread @ (np.diag(variances) + directions.T @ added @ directions) @ spread.T
@@ -217,6 +255,7 @@ def _result(
         misfits=tuple(misfits),
         suspects=shown,
         converged=converged,
+        interrupted=interrupted,
     )
 
 
@@ -232,19 +271,35 @@ def _suspects(
     """
     more, x, new = parameters.with_errors(z[:-1])
     dynamics = parameters.dynamics(parameters.values(z[:-1]))
-    clock = np.concatenate([stretched(each, dynamics) / s for each, s in zip(rows, sd)])
+    setup = information_root(more, rows, sd, np.append(x, z[-1]))[:, :-1][:, new]
+    names, others = np.array(more.coordinate_names)[new], _others(parameters.robot.joints, rows, sd, dynamics)
+    if (gains := np.char.startswith(names, "gain:")).sum() > 1:
+        others["gains"] = setup[:, gains].sum(axis=1)
+    errors, names = np.column_stack([setup, *others.values()]), np.append(names, [*others])
     r = np.concatenate([residual(each, dynamics, float(z[-1])) / s for each, s in zip(rows, sd)])
-    errors = np.column_stack([information_root(more, rows, sd, np.append(x, z[-1]))[:, :-1][:, new], clock])
-    names = [*np.array(more.coordinate_names)[new].tolist(), "clock"]
     replaced = N @ J.T @ errors
     rest = errors - J @ replaced
     power, score = np.sum(rest**2, axis=0), rest.T @ r
     power[power <= SEPARATE * np.sum(errors**2, axis=0)] = np.inf
     sizes, statistics = -score / power, score**2 / power
     probabilities = chi2.sf(statistics, 1)
-    shown = [k for k in np.argsort(-statistics).tolist() if probabilities[k] < SIGNIFICANCE / len(names)]
+    shown = [k for k in np.argsort(-statistics).tolist() if probabilities[k] < ALARMS / len(names)]
     moved = replaced[:, shown] * np.sqrt(sizes**2 + 1.0 / power)[shown]
-    return tuple(Suspect(names[k], float(sizes[k]), float(probabilities[k])) for k in shown), moved @ moved.T
+    return tuple(Suspect(str(names[k]), float(sizes[k]), float(probabilities[k])) for k in shown), moved @ moved.T
+
+
+def _others(joints: Sequence[str], rows: Sequence[Rows], sd: Sequence[Array], dynamics: Dynamics) -> dict[str, Array]:
+    """Return the derivatives of all whitened residuals with respect to each error that is not a parameter."""
+    clock = np.concatenate([stretched(each, dynamics) / s for each, s in zip(rows, sd)])
+    parts = [-each.unmodelled / s[:, None] for each, s in zip(rows, sd)]
+    slow = [part[:, -1] * (each.bin < SLOW) for each, part in zip(rows, parts)]
+    others, begin = {"clock": clock, "filter": np.concatenate(slow)}, 0
+    for each, part in zip(rows, parts):
+        own = slice(begin, begin := begin + len(part))
+        for name, column in zip(UNMODELLED[:-1], part.T):
+            others[f"{name}:{joints[each.joint]}"] = np.zeros(len(clock))
+            others[f"{name}:{joints[each.joint]}"][own] = column
+    return others
 
 
 def _misfit(rows: Rows, errors: Array, used: float) -> Misfit:

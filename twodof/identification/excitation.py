@@ -176,12 +176,13 @@ class _Design:
         offsets = any(free.group == "offset" for free in self._parameters.free)
         turning = position_derivatives(self._robot, self._values, stretch, offsets)
         rate, none = np.gradient(stretch.tau, stretch.step, axis=0), np.zeros(len(Y), np.int64)
-        signals = np.stack([np.sign(stretch.v), stretch.v, stretch.a, stretch.tau, rate])
+        signals = np.stack([np.sign(stretch.v), stretch.v, stretch.a, np.ones_like(rate), stretch.tau, rate])
         about = self._values.offset, 0.0
         rows = []
-        for i, (sign, v, a, tau, tau_rate) in enumerate(signals.transpose(2, 0, 1)):
+        for i, (sign, v, a, one, tau, tau_rate) in enumerate(signals.transpose(2, 0, 1)):
             gravity = G[:, :, i].swapaxes(0, 1)
-            rows.append(Rows(i, varying, Y[:, i], gravity, sign, v, a, tau, tau_rate, turning[:, i], none, about))
+            own = sign, v, a, one, tau, tau_rate, turning[:, i], rate, none  # `rate`: it has no unmodelled errors
+            rows.append(Rows(i, varying, Y[:, i], gravity, *own, about))
         sd = [np.full(len(Y), noise) for noise in self._noise]
         J = information_root(self._parameters, rows, sd, self._z) * self._scales
         return np.asarray(np.linalg.inv(J.T @ J + PRIOR**-2 * np.eye(len(self._z)))[:-1, :-1])

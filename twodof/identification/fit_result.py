@@ -30,6 +30,14 @@ ERRORS = {
     "gravity": "a base that is tilted by about {size:.2g} {unit} (free '{name}')",
     "offset": "positions of joint '{joint}' that need about {size:+.2g} {unit} (free '{name}')",
     "gain": "efforts of joint '{joint}' that need about {percent:+.3g} % (free '{name}')",
+    "gains": "efforts of all joints that need about {percent:+.3g} % (free 'gain:*')",
+    "bias": "efforts of joint '{joint}' that are about {size:.2g} {effort} too high, or friction that is higher by this"
+    " in the positive direction (free '{name}')",
+    "drag": "damping of joint '{joint}' by the square of its speed, {size:.2g} {effort} at 1 {unit}/s (record at the"
+    " speeds of the task)",
+    "load": "friction of joint '{joint}' that grows by about {percent:.2g} % of its load (record with the loads of the"
+    " task)",
+    "filter": "{filtered} behind a filter with a time constant of about {ms:.2g} ms (record them without it)",
     "clock": "speeds that need about {percent:+.2g} %, as of a wrong clock",
 }
 ALIKE = 100.0
@@ -80,7 +88,8 @@ class Fit:
             held-out stretches, rad or m, before and after the fit; empty if no stretch is long enough.
         settings: fitted values that a URDF cannot store, and its gravity, by variable of the FMU.
         covariance: covariance of the parameters, in their order.
-        converged: False if the solution still moved when its steps ended.
+        converged: False if the solution still moved when its steps ended; no parameter is known then.
+        interrupted: True if Ctrl-C ended the fit.
         jumps: time of the largest jump, s, by joints whose effort jumps between samples.
         curves: efforts and positions as measured, and as the model gives them.
     """
@@ -101,20 +110,23 @@ class Fit:
     settings: Mapping[str, tuple[float, ...]]
     covariance: NDArray[np.float64]
     converged: bool
+    interrupted: bool
     jumps: Mapping[str, float]
     curves: tuple[Curve, ...]
 
     @property
     def explains(self) -> bool:
-        """True if the residuals are noise, and the efforts do not jump between samples."""
-        return not self.jumps and not self.suspects and not any(misfit.bad for misfit in self.misfits)
+        """True if the fit has converged, the residuals are noise, and the efforts do not jump between samples."""
+        return (
+            self.converged and not self.jumps and not self.suspects and not any(misfit.bad for misfit in self.misfits)
+        )
 
     @property
     def rows(self) -> list[tuple[str, str, str, str, str]]:
         """Cells of the table: name, before, after, 95 % interval, unit."""
         rows = [("parameter", "before", "after", "95 % interval", "unit")]
         for p in self.parameters:
-            interval = f"{p.low:.4g} … {p.high:.4g}" if p.known else "not seen"
+            interval = f"{p.low:.4g} … {p.high:.4g}" if p.known else ("not seen" if self.converged else "not known")
             rows.append((p.name, f"{p.before:.4g}", f"{p.after:.4g}", interval, p.unit))
         return rows
 
@@ -137,12 +149,17 @@ class Fit:
     @property
     def _warnings(self) -> list[str]:
         lines = []
+        if self.interrupted:
+            missing = "no motion was predicted" if self.converged else "the values are not final, and have no intervals"
+            lines.append(f"the fit was interrupted: {missing}")
+        elif not self.converged:
+            lines.append(
+                "the fit has not converged, and no value is known: free fewer parameters, or record more motion"
+            )
         if bad := [misfit for misfit in self.misfits if misfit.bad]:
             lines.append(self._verdict(max(bad, key=lambda misfit: misfit.part)))
         if self.suspects:
             lines.append(self._suspicion())
-        if not self.converged:
-            lines.append("the fit has not converged: free fewer parameters, or record more motion")
         for joint, t in self.jumps.items():
             lines.append(
                 f"the effort of joint '{joint}' jumps between samples, most at {t:.4g} s: its course there is"
@@ -173,17 +190,24 @@ class Fit:
 
     def _suspicion(self) -> str:
         """Return the line on the errors that the residuals show most."""
-        alike = [each for each in self.suspects if each.probability <= ALIKE * self.suspects[0].probability]
+        most = ALIKE * self.suspects[0].probability
+        # a filter is tested in slow rows alone, so that other errors look more probable
+        alike = [each for each in self.suspects if each.probability <= most or each.name == "filter"]
         found = []
         for name, size, _ in alike:
             group, _, joint = name.partition(":")
-            unit = self.units[self.joints.index(joint)] if joint else "rad"
-            percent = 100.0 * (math.expm1(size) if group == "gain" else size)  # a gain's coordinate is its logarithm
-            found.append(ERRORS[group].format(name=name, joint=joint, size=size, unit=unit, percent=percent))
+            i = self.joints.index(joint) if joint else 0
+            words = {
+                "unit": self.units[i] if joint else "rad",
+                "effort": self._effort_unit(i),
+                "percent": 100.0 * (math.expm1(size) if "gain" in group else size),  # its coordinate is its logarithm
+                "filtered": "efforts" if size > 0.0 else "positions",
+                "ms": 1e3 * math.sqrt(2.0 * abs(size)),
+            }
+            found.append(ERRORS[group].format(name=name, joint=joint, size=size, **words))
         return (
             f"the residuals look like {', or '.join(found)}; if it is that, correct it: the intervals allow for it."
-            " A wrong mass or centre of a link that is not free, or a filter, can look alike, and the intervals do not"
-            " allow for these"
+            " A wrong mass or centre of a link that is not free can look alike, and the intervals do not allow for it"
         )
 
     def _effort_unit(self, joint: int) -> str:
@@ -213,6 +237,7 @@ class Fit:
             "unseen": self.unseen,
             "explains": self.explains,
             "converged": self.converged,
+            "interrupted": self.interrupted,
             "jumps": dict(self.jumps),
             "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
             "suspects": [suspect._asdict() for suspect in self.suspects],
@@ -240,8 +265,10 @@ class Fit:
         tables: dict[str, Table] = {f"{len(seen)} of {len(rows)} parameters are determined": [head, *seen]}
         if other:
             names = ", ".join(name for name, *_ in other) if len(other) <= MOST_NAMES else f"{len(other)} parameters"
-            lines.append(f"the data do not determine {names}")
-            tables["Not determined: these parameters stay near the URDF's"] = [row[:3] for row in (head, *other)]
+            if self.converged:
+                lines.append(f"the data do not determine {names}")
+            caption = "Not determined: these parameters stay near the URDF's" if self.converged else "Not final"
+            tables[caption] = [row[:3] for row in (head, *other)]
         if self.unseen:
             tables["Only together: what the data do not determine"] = [("combination",), *zip(self.unseen)]
         if self.deviation:

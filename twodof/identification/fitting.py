@@ -103,14 +103,15 @@ def fit(
 ) -> Fit:
     """Fit parameters of a robot to bags of its motion, with positions and efforts of its joints.
 
-    The last fifth of each bag is held out: it is predicted, but not used by the fit.
+    The last fifth of each bag is held out: it is predicted, but not used by the fit. Ctrl-C after the first step ends
+    the fit with its best values so far, and with the property ``interrupted``.
 
     Args:
         urdf: the URDF or xacro file with the initial values.
         bags: bags of any writer, with JointStates.
         free: names or shell patterns of the free parameters: ``friction[1]``, ``damping[1]``, ``armature[1]``,
-            ``offset:JOINT``, ``gain:JOINT``, ``mass:LINK``, ``com:LINK``, ``inertia:LINK``, ``payload``,
-            ``payload_com``, ``gravity``.
+            ``offset:JOINT``, ``gain:JOINT``, ``bias:JOINT``, ``mass:LINK``, ``com:LINK``, ``inertia:LINK``,
+            ``payload``, ``payload_com``, ``gravity``.
         output: new folder for robot.urdf, fit.json and fit.html; None: nothing is written.
         frame: link of the payload; None: "EndEffector", or the only last link.
         lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
@@ -136,7 +137,11 @@ def fit(
     finished = _counter(progress, PASSES + 2 * len(held))
     found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
-    compared = compare(model.robot, models, fitted, held, finished)
+    try:
+        compared = compare(model.robot, models, fitted, [] if found.interrupted else held, finished)
+    except KeyboardInterrupt:
+        found = found._replace(interrupted=True)
+        compared = compare(model.robot, models, fitted, [], finished)
     result = _result(model, parameters, found, compared, recordings)
     if output is not None:
         result.save(output)
@@ -264,6 +269,7 @@ def _result(
         settings=_settings(parameters, parameters.dynamics(found.values), found),
         covariance=found.covariance,
         converged=found.converged,
+        interrupted=found.interrupted,
         jumps=jumps(recordings, robot),
         curves=compared.curves,
     )

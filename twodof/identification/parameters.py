@@ -37,10 +37,11 @@ OF_JOINTS = {
     "armature": ("kg.m2", "kg"),
     "offset": ("rad", "m"),
     "gain": ("", ""),
+    "bias": ("N.m", "N"),
 }
 """Units of rotating and of sliding joints."""
 OF_THE_ROBOT = ("payload", "payload_com", "gravity")
-OF_THE_SETUP = ("gravity", "offset", "gain")
+OF_THE_SETUP = ("gravity", "offset", "gain", "bias")
 EXPONENTS, BOUNDED = ("mass", "gain"), ("friction", "damping", "armature", "payload")
 """Groups of values exp(x), and groups of values that are at least 0."""
 SIZES = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}
@@ -62,6 +63,7 @@ class Values:
         friction, damping, armature: values of the joints, n each.
         offset: true minus measured position, rad or m, n.
         gain: ratio of true to recorded effort, n.
+        bias: constant part of the effort, N·m or N, n.
         mass: masses of links, kg, k.
         com: centres of mass in the links' frames, m, k × 3.
         second: second moments of mass about the centre, in the links' axes, kg·m², k × 3 × 3.
@@ -75,6 +77,7 @@ class Values:
     armature: Numbers
     offset: Numbers
     gain: Numbers
+    bias: Numbers
     mass: Numbers
     com: Numbers
     second: Numbers
@@ -93,7 +96,7 @@ class Dynamics(NamedTuple):
     Attributes:
         inertial: ten dynamic parameters of each body about its joint's frame, in Pinocchio's order, 10·bodies;
             bodies are what joints move, with all links that are rigidly joined.
-        friction, damping, armature, offset, gain, gravity: as in ``Values``.
+        friction, damping, armature, offset, gain, bias, gravity: as in ``Values``.
     """
 
     inertial: Numbers
@@ -102,6 +105,7 @@ class Dynamics(NamedTuple):
     armature: Numbers
     offset: Numbers
     gain: Numbers
+    bias: Numbers
     gravity: Numbers
 
 
@@ -148,13 +152,13 @@ class Parameters:
         self.robot, model = robot, robot.model
         n = len(robot.joints)
         self.links, self.bodies, self.places, inertias = moving_links(urdf, model)
-        zero = np.zeros(n)
         self.start = Values(
             friction=np.array(robot.friction),
             damping=np.array(robot.damping),
-            armature=zero,
-            offset=zero,
+            armature=np.zeros(n),
+            offset=np.zeros(n),
             gain=np.ones(n),
+            bias=np.zeros(n),
             mass=np.array([inertia.mass for inertia in inertias]),
             com=np.array([inertia.lever for inertia in inertias]).reshape(-1, 3),
             second=np.array([second_moments(inertia.inertia) for inertia in inertias]).reshape(-1, 3, 3),
@@ -186,7 +190,8 @@ class Parameters:
     @property
     def coordinate_names(self) -> tuple[str, ...]:
         """Names of the coordinates, without the axes."""
-        return tuple(_of_all(free) for free in self.free for _ in range(free.size))
+        names = (free.group if free.group in OF_THE_ROBOT else free.names[0].partition(".")[0] for free in self.free)
+        return tuple(name for free, name in zip(self.free, names) for _ in range(free.size))
 
     @property
     def varying(self) -> NDArray[np.int64]:
@@ -197,7 +202,7 @@ class Parameters:
         return np.array([10 * body + k for body in sorted(bodies - {-1}) for k in range(10)], np.int64)
 
     def with_errors(self, x: Array) -> tuple[Parameters, Array, NDArray[np.bool_]]:
-        """Free gravity, offsets and gains, too; return these parameters, coordinates, and which of them are new."""
+        """Free all of OF_THE_SETUP, too; return these parameters, coordinates, and which of them are new."""
         more = copy(self)
         more.free = [free for _, free in self._known() if free in self.free or free.group in OF_THE_SETUP]
         new = np.concatenate([np.full(free.size, free not in self.free) for free in more.free])
@@ -210,7 +215,7 @@ class Parameters:
         known = []
         for group, units in OF_JOINTS.items():
             for i, (joint, slides) in enumerate(zip(self.robot.joints, self.robot.prismatic)):
-                name = f"{group}:{joint}" if group in ("offset", "gain") else f"{group}[{i + 1}]"
+                name = f"{group}:{joint}" if group in ("offset", "gain", "bias") else f"{group}[{i + 1}]"
                 known.append((name, Free(group, i, (name,), (units[slides],))))
         for i, link in enumerate(self.links):
             com = tuple(f"com:{link}.{axis}" for axis in "xyz")
@@ -343,7 +348,3 @@ class Parameters:
 def _reported(own: Numbers) -> Numbers:
     """Return the named values of a parameter; of second moments of mass, those of the inertia."""
     return np.array([inertia_of(own)[place] for place in INERTIA.values()]) if own.ndim == 2 else own.ravel()
-
-
-def _of_all(free: Free) -> str:
-    return free.group if free.group in OF_THE_ROBOT else free.names[0].partition(".")[0]

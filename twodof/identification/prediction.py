@@ -60,7 +60,9 @@ def predict(robot: Robot, values: Dynamics, delay: float, stretch: Stretch) -> P
     """
     plant, h = plant_of(robot, values, stretch.step), stretch.step
     edges = stretch.t[:, None] + np.array([0.0, 0.5 * h]) - delay  # beginning and middle of each step
-    effort = np.stack([np.interp(edges[:, 1], stretch.t, column) for column in stretch.tau.T], 1) * values.gain
+    effort = (
+        np.stack([np.interp(edges[:, 1], stretch.t, column) for column in stretch.tau.T], 1) * values.gain - values.bias
+    )
     q = np.full_like(stretch.q, np.nan)
     begins = range(0, len(q) - 1, max(1, round(WINDOW / h)))
     for begin, end in zip(begins, [*begins[1:], len(q)]):

@@ -1,6 +1,6 @@
 """Inverse dynamics along measured motion as a regression whose rows have independent noise.
 
-    τ_rec(t − delay) = (Y(q, v, q̈) π + F sgn v + D v + armature q̈)/gain + noise
+    τ_rec(t − delay) = (Y(q, v, q̈) π + F sgn v + D v + armature q̈ + bias)/gain + noise
 
 π are the ten inertial parameters of each body. For each joint and each stretch in which it moves, rows are coefficients
 in an orthonormal basis of smooth functions within the band. White noise stays white in this basis, and position noise,
@@ -33,6 +33,9 @@ LEAST_SAMPLES, LONGEST = 12, 400
 """Smallest and largest number of samples of a stretch in which a joint moves; a longer one is divided."""
 EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Edges of the frequency bins, in each of which noise has one variance, as fractions of the band."""
+UNMODELLED = ("drag", "load", "filter")
+"""Errors that are no parameters: damping by the square of the speed, friction in proportion to the load, and a low-pass
+filter, whose size is half the square of its time constant, s²."""
 
 
 class Rows(NamedTuple):
@@ -43,9 +46,10 @@ class Rows(NamedTuple):
         varying: indices of the m inertial parameters that vary, of 10·bodies; the others have the URDF's values.
         Y: regressor of the varying inertial parameters without gravity, and the effort of the others, K × (m + 1).
         G: the same per m/s² of gravity along x, y and z of the root, 3 × K × (m + 1).
-        sign, v, a: regressors of friction, damping and armature, K each.
+        sign, v, a, one: regressors of friction, damping, armature and bias, K each.
         tau, tau_rate: recorded effort and its derivative, K.
         offsets: derivative of the inverse dynamics with respect to positions, K × n.
+        unmodelled: efforts of each of UNMODELLED of size 1, K × 3.
         bin: index of each row's frequency bin, K.
         about: offsets, n, and delay of the efforts, s, at which the rows were linearised.
     """
@@ -57,9 +61,11 @@ class Rows(NamedTuple):
     sign: Array
     v: Array
     a: Array
+    one: Array
     tau: Array
     tau_rate: Array
     offsets: Array
+    unmodelled: Array
     bin: NDArray[np.int64]
     about: tuple[Array, float]
 
@@ -109,6 +115,8 @@ def rows_of(
         turning = position_derivatives(robot, values, stretch, with_offsets)
         late = _delayed(stretch, delay)
         rate = np.gradient(late, stretch.step, axis=0)
+        joint = np.sign(stretch.v), stretch.v, stretch.a, np.ones_like(rate), late, rate
+        signals = np.dstack([*joint, *unmodelled(stretch, values, Y, G, varying)])
         for i, rows in enumerate(found):
             for begin, end in _runs(stretch.moving[:, i]):
                 if end - begin < LEAST_SAMPLES:
@@ -116,24 +124,21 @@ def rows_of(
                 at = slice(begin, end)
                 frequency = np.arange(end - begin) / (2.0 * (end - begin) * stretch.step)
                 keep = int(np.searchsorted(frequency, stretch.band[i]))
-                columns = np.column_stack(
-                    [
-                        Y[at, i], *(G[at, axis, i] for axis in range(3)), turning[at, i], np.sign(stretch.v[at, i]),
-                        stretch.v[at, i], stretch.a[at, i], late[at, i], rate[at, i],
-                    ]
-                )  # fmt: skip
                 size, n = Y.shape[2], len(robot.joints)
+                gravity = (G[at, axis, i] for axis in range(3))
+                columns = np.column_stack([Y[at, i], *gravity, turning[at, i], signals[at, i]])
                 parts = np.split(smooth_basis(end - begin, keep) @ columns, [size, 4 * size, 4 * size + n], axis=1)
                 bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
-                gravity = parts[1].reshape(keep, 3, size).transpose(1, 0, 2)
-                sign, v, a, tau, tau_rate = parts[3].T
-                rows.append(Rows(i, varying, parts[0], gravity, sign, v, a, tau, tau_rate, parts[2], bins, about))
+                G_rows = parts[1].reshape(keep, 3, size).transpose(1, 0, 2)
+                sign, v, a, one, tau, tau_rate, *others = parts[3].T
+                own = sign, v, a, one, tau, tau_rate, parts[2], np.column_stack(others), bins
+                rows.append(Rows(i, varying, parts[0], G_rows, *own, about))
     return [_joined(rows) for rows in found]
 
 
 def _joined(rows: list[Rows]) -> Rows:
     """Return the rows of all stretches of a joint as one."""
-    names = ("Y", "G", "sign", "v", "a", "tau", "tau_rate", "offsets", "bin")
+    names = ("Y", "G", "sign", "v", "a", "one", "tau", "tau_rate", "offsets", "unmodelled", "bin")
     parts: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in rows], axis=int(name == "G")) for name in names
     }
@@ -185,6 +190,18 @@ def position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wante
     return out
 
 
+def unmodelled(stretch: Stretch, values: Dynamics, Y: Array, G: Array, varying: NDArray[np.int64]) -> list[Array]:
+    """Return the efforts, N × n, of each of UNMODELLED of size 1; Y and G are those of ``regressors``.
+
+    A filter of a time constant T changes a smooth effort by a delay and, in the second order, by T²/2 times its second
+    derivative. Friction is not smooth.
+    """
+    load = (Y + np.einsum("g,kgij->kij", values.gravity, G)) @ np.append(values.inertial[varying], 1.0)
+    v, smooth = stretch.v, load + values.damping * stretch.v + values.armature * stretch.a
+    bent = np.gradient(np.gradient(smooth, stretch.step, axis=0), stretch.step, axis=0)
+    return [each / values.gain for each in (v * np.abs(v), np.sign(v) * np.abs(load), bent)]
+
+
 def residual(rows: Rows, values: Dynamics, delay: float) -> Array:
     """Return the residuals of one joint's rows, N·m or N."""
     return np.asarray(
@@ -197,7 +214,7 @@ def modelled(rows: Rows, values: Dynamics) -> Array:
     i = rows.joint
     links = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ _inertial(rows, values)
     joint = values.friction[i] * rows.sign + values.damping[i] * rows.v + values.armature[i] * rows.a
-    return np.asarray(links + joint + rows.offsets @ (values.offset - rows.about[0]))
+    return np.asarray(links + joint + values.bias[i] * rows.one + rows.offsets @ (values.offset - rows.about[0]))
 
 
 def _inertial(rows: Rows, values: Dynamics) -> Array:
@@ -216,7 +233,7 @@ def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
     i, gain = rows.joint, values.gain[rows.joint]
     columns = (rows.Y + np.tensordot(values.gravity, rows.G, 1))[:, :-1] @ rates.inertial[rows.varying]
     columns += np.einsum("kij,j->ik", rows.G, _inertial(rows, values)) @ rates.gravity + rows.offsets @ rates.offset
-    for group, column in (("friction", rows.sign), ("damping", rows.v), ("armature", rows.a)):
+    for group, column in (("friction", rows.sign), ("damping", rows.v), ("armature", rows.a), ("bias", rows.one)):
         columns += np.outer(column, getattr(rates, group)[i])
     columns -= np.outer(modelled(rows, values) / gain, rates.gain[i])
     return np.column_stack([-columns / gain, -rows.tau_rate])
