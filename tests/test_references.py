@@ -23,7 +23,7 @@ from tools import needs
 
 import twodof
 from twodof.cli.main import main
-from twodof.errors import FmuError, InputError, SimulationError
+from twodof.errors import BuildError, FmuError, InputError, SimulationError
 from twodof.export.compiler import UNITS
 from twodof.fmu import checking
 from twodof.fmu.description import load_any_fmu
@@ -400,6 +400,18 @@ def test_damaged_references_fail_their_row(
     files[FOLDER + name] = files[FOLDER + name].replace(old, new)
     found = rows(packed(files, tmp_path / "damaged.fmu"))
     assert any(row.outcome == "failed" and text in row.text for row in found.values()), found
+
+
+def test_a_sensitive_motion_with_impacts_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def differing(*_: object) -> None:
+        raise BuildError("no references: solvers and closed form differ by 0.1 in q[1]")
+
+    monkeypatch.setattr("twodof.export.references._narrowed", differing)
+    fmu = twodof.build_fmu(tmp_path / "arm.fmu", twodof.FmuOptions(native=True, reference=True))
+    assert [reference.name for reference in references_of(load_any_fmu(fmu))] == ["move", "push", "sample"]
+    assert "no reference has friction and stops: solvers and closed form differ by 0.1 in q[1]" in caplog.messages
 
 
 def test_the_units_of_an_fmu_are_read_once(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
