@@ -661,5 +661,7 @@ def test_an_error_that_grows_under_a_load_is_not_a_matter_of_time() -> None:
     settings = {"Kp[3]": 0.1, "f_ext": (5.0, 0.0, 0.0), "x_des": None}
     panda = fmu_of("panda", "task")
     start = tuple(twodof.load_fmu(panda).start_values[f"x_des[{i}]"] for i in (1, 2, 3))
-    summary = twodof.simulate(panda, settings={**settings, "x_des": start})
+    run, kept = twodof.experiment(panda, settings={**settings, "x_des": start}), Kept()
+    summary = twodof.simulate(run, kept)
     assert summary.repeat is None and summary.verdict.causes[0].subject == "f_ext", summary.verdict
+    assert page_causes(run, kept.samples)[0]["subject"] == "f_ext"

@@ -21,17 +21,20 @@ export function weight(kind, subject, parts) {
 
 /**
  * Causes by their parts in the error, without those that are small; opposed forces are noted. `reach` is the part of a
- * target out of reach, `passed` the time since the last change of the target, s.
+ * target out of reach, `passed` the time since the last change of the target, s, and `grown` whether the error has grown.
  */
-/** @type {(found: Cause[], parts: Map<string, number>, order: string[], of: {reach: number, passed: number}) => Cause[]} */
-export function byParts(found, parts, order, { reach, passed }) {
+/** @type {(found: Cause[], parts: Map<string, number>, order: string[], of: {reach: number, passed: number, grown: boolean}) => Cause[]} */
+export function byParts(found, parts, order, { reach, passed, grown }) {
+  const loads = found.filter(({ kind }) => kind === "load").map(({ subject }) => weight("load", subject, parts));
+  const thrown = grown && Math.min(0, ...loads) <= -LASTING && Math.max(...loads) < LASTING; // no time makes an error grow
   const limits = weight("limit", "", parts), bounds = limits + weight("singularity", "", parts);
   const net = bounds + Math.min(0, parts.get("sampling ") ?? 0), left = reach > SMALL ? net - reach : bounds; // a stop also balances wrong efforts
   /** @type {(cause: Cause) => number} */
   const most = ({ kind, subject }) => {
     const own = weight(kind, subject, parts);
     if (kind === "reach") return reach;
-    if (kind === "load" && own <= -LASTING && bounds >= LASTING && Math.abs(limits + own) < LASTING) return bounds + LASTING; // it has brought the arm to a limit
+    const atLimit = bounds >= LASTING && Math.abs(limits + own) < LASTING;
+    if (kind === "load" && own <= -LASTING && (thrown || atLimit)) return Math.max(bounds, weight("time", "", parts)) + LASTING; // it has brought the arm there
     if (["unstable", "sampling"].includes(kind)) return Math.max(own, left > EXPLAINED ? left : 0, weight("saturation", "", parts));
     if (kind === "singularity" && reach > SMALL) return Math.min(own, reach);
     return kind !== "limit" || reach <= SMALL ? own : bounds - reach > EXPLAINED ? Math.min(own, bounds - reach) : 0;
@@ -41,7 +44,7 @@ export function byParts(found, parts, order, { reach, passed }) {
     const first = kind === "degrees" || (kind === "unstable" && cause.share * passed > GROWN), reduces = all <= -SMALL && !MOVING.includes(kind);
     const opposed = reduces || (FOLLOWING.includes(kind) && all < SMALL && Math.abs(own) >= SMALL);
     const counts = first || MOTION.includes(kind) || opposed || (all >= SMALL && Math.abs(own) >= SMALL);
-    if (!counts || (kind === "time" && all < LASTING)) return [];
+    if (!counts || (kind === "time" && (thrown || all < LASTING))) return [];
     cause.noted = opposed || MOTION.includes(kind);
     return [{ cause, keys: [Number(!first), cause.noted ? Infinity : kind === "reach" && all >= LASTING ? -Infinity : -Math.round(10 * all), order.indexOf(kind), -own, -cause.share] }];
   });

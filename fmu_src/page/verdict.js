@@ -85,8 +85,8 @@ export class Verdict {
     const order = this.robot.facts.causes, far = Math.max(0, ...found.filter(({ kind }) => kind === "reach").map(({ share }) => share));
     const size = Math.sqrt(this.late().reduce((sum, k) => sum + this.errors(k)[0] ** 2, 0) / this.late().length);
     const last = this.session.count - 1, passed = this.session.time(last) - this.session.time(this.began);
-    const reach = far / Math.max(size, FLOOR);
-    const ranked = parts.size ? byParts(found, parts, order, { reach, passed }) : byKinds(found, order);
+    const reach = far / Math.max(size, FLOOR), now = this.errors(last), grown = missed.every((off, i) => !off || now[i] > this.way[i]);
+    const ranked = parts.size ? byParts(found, parts, order, { reach, passed, grown }) : byKinds(found, order);
     if (ranked.length) ranked[0].noted = MOTION.includes(ranked[0].kind) && missed.includes(true); // a peak makes no error
     return ranked;
   }
