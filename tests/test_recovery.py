@@ -404,7 +404,7 @@ def test_the_provenance_of_many_robots_is_not_held_without_a_limit(run, tmp_path
     (damaged / "run.json").unlink(missing_ok=True)
     monkeypatch.setattr(recovery, "MAX_PROVENANCES", 2000)
     found = twodof.recover(damaged)
-    assert "'run.c.json', with which" in found.damage and "run.b" not in found.damage
+    assert "'run.c.json', because files" in found.damage and "run.b" not in found.damage
     assert sorted(file.name for file in damaged.glob("*.json")) == ["run.a.json", "run.b.json"]
     assert sum(found.counts.values()) > 0
 

@@ -265,10 +265,13 @@ def test_a_run_with_a_steering_sink_and_one_of_a_python_fmu_have_no_trial(
 def test_a_repetition_that_fails_is_left_out_and_logs_nothing(
     fmus: dict[str, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
-    summary = twodof.simulate(fmus["task"], settings={"f_ext": (1e9, 0.0, 0.0)}, stop_time=0.5)
-    logged = len(caplog.records)
+    settings = {"f_ext": (1e9, 0.0, 0.0), "q_max": (0.6, 0.4)}
+    with pytest.raises(SimulationError, match="need more than 2000000 evaluations"):
+        twodof.simulate(fmus["task"], settings={**settings, "q_max": 10.0}, stop_time=0.5)
+    caplog.clear()
+    summary = twodof.simulate(fmus["task"], settings=settings, stop_time=0.5)
     assert any(cause.kind == "limit" and not cause.tried for cause in summary.verdict.causes)
-    assert len(caplog.records) == logged
+    assert not [record for record in caplog.records if "evaluations" in record.getMessage()]
 
 
 def test_a_replaced_fmu_leaves_the_causes_as_they_are(fmus: dict[str, Path], tmp_path: Path) -> None:

@@ -123,9 +123,11 @@ static void find_chatter(AntiChatter *chatter, const Step *step, const Event *ev
 {
     for (int i = 0; i < N_JOINTS; i++) {
         const double passed = t - chatter->left[i], speed = fabs(step->y[N_JOINTS + i]);
-        double hold = chatter->chatter_time;
+        double hold = chatter->chatter_time, error = speed * passed;
+        if (chatter->rigid) /* mutual impacts repeat too often at a finer tolerance than the usual one */
+            error *= coarseness(step->plant);
         if (event->stopped[i] && passed < hold)
-            hold = bounded(hold, step, i, speed * passed, passed);
+            hold = bounded(hold, step, i, error, passed);
         chatter->chattering[i] = event->stopped[i] && passed < (chatter->rigid ? chatter->chatter_time : hold);
         if (chatter->chattering[i]) {
             chatter->longest = fmin(chatter->longest, hold);

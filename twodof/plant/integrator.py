@@ -107,7 +107,8 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
         t, y, event = motion.until_event(y, rates, t, min(end, h), hold_ends=end < h and not rank_held)
         for i in event.stopped:
             passed = t - left[i]
-            hold = stop_time(passed, y[n + i], motion.tolerance(y[i]), chatter_time)
+            usual = motion.coarseness if stops.rigid else 1.0
+            hold = stop_time(passed, y[n + i], motion.tolerance(y[i]) / usual, chatter_time)
             if passed < (chatter_time if stops.rigid else hold):
                 chattering[i], longest = True, min(longest, hold)
                 soon = soon if passed < FIRST_HOLD * chatter_time else max(soon, hold)
