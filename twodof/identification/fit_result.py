@@ -202,7 +202,6 @@ class Fit:
                 "effort": self._effort_unit(i),
                 # the coordinate of a gain is its logarithm
                 "percent": 100.0 * (math.expm1(min(size, 99.0)) if "gain" in group else size),
-                * (math.expm1(min(size, 99.0)) if "gain" in group else size),  # its coordinate is its logarithm
                 "filtered": "efforts" if size > 0.0 else "positions",
                 "ms": 1e3 * math.sqrt(2.0 * abs(size)),
             }
