@@ -3,6 +3,7 @@
 import html
 import json
 import tracemalloc
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,18 @@ def test_a_run_without_changes_is_replayed_from_its_start(native_path, tmp_path,
     other = twodof.read_bag(tmp_path / "other")
     np.testing.assert_array_equal(other.target[0], (0.2, 0.1))  # what is said has the last word
     assert other.provenance["start_values"]["Kp[1]"] == 80.0
+
+
+def test_a_change_of_a_vector_counts_for_each_element(native_path, tmp_path, monkeypatch):
+    twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.05, changes=[(0.01, {"x_des": 0.2})])
+    file = tmp_path / "bag/run.json"
+    content = json.loads(file.read_text())
+    content["input_changes"] = [[0.01, {"x_des": 0.2}]]
+    file.write_text(json.dumps(content))
+    for room, fits in ((10, True), (9, False)):  # 8 for a change and 2 elements
+        monkeypatch.setattr("twodof.bag.recorded_commands.MAX_HELD", room)
+        with nullcontext() if fits else pytest.raises(InputError, match="has more than 9 values of inputs"):
+            assert len(twodof.read_commands(native_path, tmp_path / "bag")) == 2
 
 
 def test_a_run_of_another_control_is_not_replayed(native_path, effort, tmp_path, capfd):

@@ -98,3 +98,30 @@ def test_a_long_start_value_is_cut_and_does_not_widen_the_table(native_path, tmp
     lines = capsys.readouterr().out.splitlines()
     assert sum(len(line) > 200 for line in lines) == 1 and max(map(len, lines)) < 1200
     assert any("… (1000000 characters)" in line for line in lines)
+
+
+LONG = "u" * 1001
+TEXTS = {
+    "a unit": (r'<Unit name="m"', rf'<Unit name="{LONG}"/>\g<0>', "name 'uuu.*of a <Unit> has more than 1000"),
+    "a variable": (r'name="Kn"', rf'name="{LONG}"', "name 'uuu.* has more than 1000"),
+    "a maximum": (r'(name="Kn"[^>]*?) min="', r"\g<1> min=" + '"' + " " * 1001, "min '.*has more than 1000"),
+    "a scalar": (r'(name="Kn"[^>]*start=")', r"\g<1>" + " " * 1001, "start '.*has more than 1000"),
+    "a word of an array": (r'start="0.2 ', 'start="0.2' + "0" * 1001 + " ", "start '0.2.*has more than 1000"),
+    "display units": (
+        r'<Unit name="m"',
+        r'<Unit name="M">' + "".join(f'<DisplayUnit name="d{i}"/>' for i in range(101)) + r"</Unit>\g<0>",
+        "unit 'M' has more than 100 display units",
+    ),
+}
+"""Texts that each variable, element or alias would repeat or search."""
+
+
+@pytest.mark.parametrize(("pattern", "text", "culprit"), TEXTS.values(), ids=TEXTS)
+def test_a_text_that_others_repeat_is_limited(of_fmi3, tmp_path, pattern, text, culprit):
+    with pytest.raises(twodof.TwoDofError, match=culprit):
+        twodof.load_fmu(forged(of_fmi3, tmp_path, pattern, text))
+
+
+def test_the_description_of_an_array_is_cut(of_fmi3, tmp_path):
+    fmu = twodof.load_fmu(forged(of_fmi3, tmp_path, r'(name="x_des"[^>]*description=")', r"\g<1>" + LONG))
+    assert {len(fmu.variables[f"x_des[{i}]"].description) for i in (1, 2)} == {1000}

@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from collections import Counter
+from unittest.mock import Mock
 
 import browser
 import numpy as np
@@ -12,7 +13,7 @@ import twodof
 from twodof.cli.main import main
 from twodof.geometry.meshes import Meshes, ReadMesh, Surface
 from twodof.geometry.shapes import link_shapes
-from twodof.plant.urdf import read_urdf
+from twodof.plant.urdf import RobotError, read_urdf
 
 ONE = np.ones(3)
 
@@ -160,3 +161,13 @@ def coloured(shown: np.ndarray) -> tuple[int, int]:
     r, g, b = np.moveaxis(shown.astype(int), -1, 0)
     red, green = (r > 100) & (g < r / 2) & (b < r / 2), (g > 80) & (r < g / 2) & (b < g / 2)
     return int(red.sum()), int(green.sum())
+
+
+def test_visuals_of_one_missing_mesh_read_it_once_and_a_long_colour_is_refused():
+    visual = '<visual><geometry><mesh filename="package://none.stl"/></geometry><material name="m"/></visual>'
+    material = '<material name="m"><color rgba="1 1 1 1"/></material>'
+    text = f'<robot name="r">{material}<link name="l">{visual * 3}</link></robot>'
+    read = Mock(return_value=None)
+    assert link_shapes(read_urdf(text), read)[1] == ["none.stl"] and read.call_count == 2  # as a mesh, and at the end
+    with pytest.raises(RobotError, match="link 'l' cannot be drawn: rgba has more than 1000 characters"):
+        link_shapes(read_urdf(text.replace("1 1 1 1", "1 " * 501)), read)

@@ -196,7 +196,7 @@ ARRAYS = {
     "20,000 dimensions": (arrays('start="49000"', *['start="1"'] * 20_000), "more than 16 dimensions"),
     "40,000 names": (arrays('start="40000"', aliases=40_000), TOO_MANY),
     "300,000 names of a scalar": (arrays(aliases=300_000), TOO_MANY),
-    "a name of 100,000 characters": (arrays('start="49000"', name="A" * 100_000), "name of more than 1000 characters"),
+    "a name of 100,000 characters": (arrays('start="49000"', name="A" * 100_000), "has more than 1000 characters"),
     "100,000 variables without a name": (arrays(more="<Float64/>" * 100_000), "'name' is required"),
     "as many as there may be": (arrays('start="49998"'), "names|to log|cannot be loaded"),
     "a step of 1e-300 s": (arrays('start="2"', step="1e-300"), "at least 1e-06 s"),

@@ -276,7 +276,7 @@ def test_a_robot_without_messages_is_known_by_its_provenance(native_path, tmp_pa
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     (tmp_path / "bag/run.json").rename(tmp_path / "bag/run.old.json")
     for read in (read_bag, read_ends):
-        with pytest.raises(BagError, match=r"no joint states of the robot that its run\.old\.json"):
+        with pytest.raises(BagError, match=r"no joint states of the robot of its run\.old\.json"):
             read(tmp_path / "bag")
 
 

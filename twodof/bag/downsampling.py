@@ -36,7 +36,8 @@ class Downsampler:
         while len(chosen) > self.most / 4 and self._span < duration:
             self._span *= 2
             chosen = extremes(bag.stamps // self._span, lines)
-        return chosen
+        fewer = np.linspace(0, len(chosen) - 1, int(self.most / 4)).astype(int)  # of more curves than samples
+        return chosen[fewer] if len(chosen) > self.most / 4 else chosen
 
 
 def extremes(parts: NDArray[np.int64], lines: Sequence[Array]) -> Indices:

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..bounds import CHANGE, MAX_COMMANDS, MAX_COMMANDS_SIZE, MAX_FOLLOWED, MAX_POINTS, MIB
+from ..bounds import CHANGE, MAX_COMMANDS, MAX_COMMANDS_SIZE, MAX_FOLLOWED, MAX_HELD, MAX_POINTS, MIB
 from ..errors import BagError, InputError
 from ..files import shown
 from ..fmu import Fmu, load_fmu
@@ -67,7 +67,12 @@ def read_commands(
         if KNOWN_UNTIL in provenance:
             raise InputError(f"'{path}' has inputs only until {provenance[KNOWN_UNTIL]:g} s")
         start = provenance["start_time"]
-        changes = [(t - start, resolve(fmu, values)) for t, values in provenance["input_changes"]]
+        changes, room = [], MAX_HELD  # a change of a vector counts for each element
+        for t, values in provenance["input_changes"]:
+            changes.append((t - start, resolve(fmu, values)))
+            room -= CHANGE + len(changes[-1][1])
+            if room < 0:
+                raise InputError(f"'{path}' has more than {MAX_HELD} values of inputs")
         return [(-inf, resolve(fmu, _inputs(fmu, provenance["start_values"]))), *changes]
     follows = Commands(fmu)
     types = (*follows.types, *[JOINT_TRAJECTORY] * all(map(fmu.vector, (*FOLLOWING, "q_start"))))

@@ -30,7 +30,7 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     tree = ET.fromstring(urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
-    missing: list[str] = []
+    missing: dict[str, None] = {}
     room = MAX_MESHES
     for mesh in tree.iter("mesh"):
         uri = mesh.get("filename")
@@ -49,18 +49,18 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
                     room -= len(colours)
                 names[uri] = name
             except FileNotFoundError:
-                missing.append(uri)
+                missing[uri] = None
                 continue
             except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: a circle of links
                 reason = (isinstance(error, OSError) and error.strerror) or error
                 raise BuildError(f"mesh '{uri}' cannot be read: {reason}") from error
         mesh.set("filename", f"package://{names[uri]}")
     if missing:
-        missing[MAX_LISTED:] = [f"{len(missing) - MAX_LISTED} more"] * (len(missing) > MAX_LISTED)
+        listed = [*missing][:MAX_LISTED] + [f"{len(missing) - MAX_LISTED} more"] * (len(missing) > MAX_LISTED)
         LOG.warning(
             "meshes are left out, as they were not found; give their folder, or that of their"
             " packages, with `mesh_dir`: %s",
-            ", ".join(missing),
+            ", ".join(listed),
         )
     return ET.tostring(tree, encoding="unicode") + "\n", files
 

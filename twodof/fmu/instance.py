@@ -126,7 +126,9 @@ class Instance:
         for name, value in values.items():
             variable = self.fmu.variables[name]
             key = variable.type, variable.reference
-            changed.setdefault(key, list(self._vectors[key]))[variable.element] = value
+            if key not in changed:
+                changed[key] = list(self._vectors[key])
+            changed[key][variable.element] = value
         for kind, setter in self._setters.items():
             own = {reference: vector for (of, reference), vector in changed.items() if of == kind}
             if own:

@@ -10,6 +10,7 @@ from math import inf, prod
 
 from fmpy.model_description import ModelVariable
 
+from ..bounds import MAX_NAME
 from ..errors import FmuError
 from ..export.typed_values import LARGEST, WHOLE, Type
 from .validation import NUMBERS
@@ -78,7 +79,7 @@ def scalars(variable: ModelVariable, items: Mapping[str, int]) -> Iterator[Scala
         type=kind,
         unit=variable.unit,
         start=variable.start,
-        description=variable.description or "",
+        description=(variable.description or "")[:MAX_NAME],
         reference=variable.valueReference,
         variability=variable.variability,
         relative=bool(variable.relativeQuantity),

@@ -224,6 +224,8 @@ class _File:
     def _bound(self, binding: ET.Element, name: str) -> Iterator[Parameter]:
         root = self._content(binding, f"{SSD}ParameterValues", SSV, "ParameterValues", name)
         units, prefix = units_in(root.find(f"{SSV}Units")), binding.get("prefix", "")
+        if len(prefix) > MAX_NAME:
+            raise FmuError(f"'{self._path}': a prefix of parameters has more than {MAX_NAME} characters")
         given: dict[str, Parameter] = {}
         rows = root.findall(f"{SSV}Parameters/{SSV}Parameter")
         self._check_once([xml.get("name", "") for xml in rows], f"a parameter set of '{name or 'the system'}' sets")

@@ -13,7 +13,7 @@ import fmpy
 import lxml.etree
 from fmpy.model_description import ModelDescription
 
-from ..bounds import MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME
+from ..bounds import MAX_DIMENSIONS, MAX_DISPLAY_UNITS, MAX_ELEMENTS, MAX_NAME
 
 SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3": "fmi3/fmi3ModelDescription"}
 """Schema files in FMPy, by the major version of FMI."""
@@ -78,14 +78,15 @@ def _complete(description: ModelDescription, root: ET.Element) -> None:
 
 
 def check_description(root: ET.Element, xml: bytes) -> None:
-    """Check the sizes of names and arrays, and the schema.
+    """Check the sizes of texts and arrays, and the schema.
 
     FMPy also checks the schema, but on a parsed tree, for which libxml2 takes quadratic time in the number of errors.
 
     Raises:
-        ValueError: a name or an array is too large.
+        ValueError: a text or an array is too large.
         lxml.etree.XMLSyntaxError: the schema does not allow the text.
     """
+    _check_texts(root)
     _check_arrays(root)
     if name := SCHEMAS.get(root.get("fmiVersion", "").partition(".")[0]):  # FMPy refuses other versions
         schema = lxml.etree.XMLSchema(file=Path(fmpy.__file__).parent / "schema" / f"{name}.xsd")
@@ -108,14 +109,31 @@ def problems_of_times(root: ET.Element) -> list[str]:
     return wrong + ([] if 0.0 < step < math.inf else [f"DefaultExperiment: its step of {step:g} s is not > 0"])
 
 
+def _check_texts(root: ET.Element) -> None:
+    """Raise ValueError for long texts of variables, types and units, of which each use or element has a copy.
+
+    A description is cut, and the start value of a scalar String has any length.
+    """
+    for path in ("UnitDefinitions//*", "TypeDefinitions//*", "ModelVariables//*"):
+        for each in root.iterfind(path):
+            array = each.find("Dimension") is not None
+            texts = [(key, text) for key, text in each.items() if key != "description" and each.tag != "Start"]
+            texts += [("start", start.get("value", "")) for start in each.findall("Start") if array]
+            for key, text in texts:
+                words = text.split() if array and key == "start" and each.tag != "String" else [text]
+                scalar_string = each.tag == "String" and key == "start" and not array
+                if max(map(len, words), default=0) > MAX_NAME and not scalar_string:
+                    raise ValueError(f"{key} '{text:.40}'… of a <{each.tag}> has more than {MAX_NAME} characters")
+            if len(each.findall("DisplayUnit")) > MAX_DISPLAY_UNITS:
+                raise ValueError(f"unit '{each.get('name')}' has more than {MAX_DISPLAY_UNITS} display units")
+
+
 def _check_arrays(root: ET.Element) -> None:
-    """Raise ValueError for names that are too long, invalid sizes, and too many elements, including aliases."""
+    """Raise ValueError for invalid sizes and too many elements, including aliases."""
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
     room = MAX_ELEMENTS
     for variable in root.iterfind("ModelVariables/*"):
         names = [each.get("name", "") for each in (variable, *variable.iterfind("Alias"))]
-        if any(len(name) > MAX_NAME for name in names):
-            raise ValueError(f"a variable has a name of more than {MAX_NAME} characters: '{names[0][:40]}'…")
         name, dimensions = names[0], variable.findall("Dimension")
         texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
         if len(texts) > MAX_DIMENSIONS:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..bounds import MAX_NAME
 from ..plant.numerals import number
 from ..plant.urdf import RobotError, Urdf
 from .kinematics import Array, Placement
@@ -43,7 +44,7 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
     Raises:
         RobotError: an attribute of a shape is not a number.
     """
-    shapes, missing = [], []
+    shapes, empty = [], dict[str, None]()
     named = {material.get("name"): material for material in reversed(robot.tree.findall("material"))}
     with Meshes(read) as meshes:
         for link in robot.tree.findall("link"):
@@ -59,9 +60,9 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
                 except ValueError as error:
                     raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
                 shapes += [Shape(name, transform, s.colour or colour, *s[:2]) for s in drawn]
-                if element.tag == "mesh" and not drawn and read(_file(element)) is None:
-                    missing.append(_file(element))
-    return shapes or _sticks(robot), missing
+                if element.tag == "mesh" and not drawn:
+                    empty[_file(element)] = None
+    return shapes or _sticks(robot), [file for file in empty if read(file) is None]
 
 
 def _file(element: ET.Element) -> str:
@@ -149,9 +150,11 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
     """Return the numbers of an attribute.
 
     Raises:
-        ValueError: it has another number of values, or a value that is not a number.
+        ValueError: it is too long, or has a value that is not a number.
     """
     text = default if element is None else element.get(key, default)
+    if len(text) > MAX_NAME:  # many visuals may share a material
+        raise ValueError(f"{key} has more than {MAX_NAME} characters")
     numbers = np.array([number(word) for word in text.split()])
     if not np.isfinite(numbers).all():
         raise ValueError(f"{key}='{text}' is not finite")

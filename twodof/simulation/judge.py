@@ -144,6 +144,7 @@ class Judge:
         if end < len(rows) and not self.lost:
             what = f"beyond {MAX_VALUE:g}" if np.isfinite(rows[end]).all() else "not finite"
             self.lost = (Cause("diverged", f"a value is {what} at {t[end]:.4g} s", time=float(t[end])),)
+            self.targets = {name: target[:1] for name, target in targets.items()}
         if not end:
             return
         if end < len(rows):

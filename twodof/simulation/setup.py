@@ -150,7 +150,8 @@ def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, flo
 def _inertials(fmu: Fmu, robot: Urdf | None) -> dict[str, float]:
     """Return the URDF's values for links that are inputs; start values that differ by rounding alone are the URDF's."""
     inputs = (name for name, v in fmu.variables.items() if fmu.control and v.causality == "input")
-    found = {name: float(fmu.start_values[name]) for name in inputs if name.partition("_")[0] in OF_LINKS}
+    starts = fmu.start_values
+    found = {name: float(starts[name]) for name in inputs if name.partition("_")[0] in OF_LINKS}
     if not found or robot is None:
         return found
     from ..geometry.kinematics import Kinematics  # as above

@@ -177,9 +177,9 @@ def conclude(judge: Judge, repeat: Repeat | None = None) -> Verdict:
     """
     judge.flush()
     if not judge.count:
-        return Verdict(
-            "no target", "diverging", 0, 0.0, {}, judge.lost, tuple(f"no target; {c.text}" for c in judge.lost)
-        )
+        outcome = "not reached" if judge.targets else "no target"
+        lines = tuple(f"{outcome}; {cause.text}" for cause in judge.lost)
+        return Verdict(outcome, "diverging", 0, 0.0, {}, judge.lost, lines)
     extreme = [*_extreme(judge)]
     numbers = {name: value for name, value in judge.metrics().items() if not np.isnan(value)}
     t, signals, scale = _signals(judge)
