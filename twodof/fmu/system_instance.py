@@ -155,12 +155,14 @@ class SystemInstance:
     def _in_order(self, batches: Sequence[Sequence[Node]]) -> tuple[list[Move], Callable[[], dict[Node, float]]]:
         """Return functions that pass outputs to inputs in an order, and one that returns the latest Real outputs."""
         signals, columns = (c_double * max(1, sum(map(len, batches))))(), dict[Node, int]()
-        moves = [move for batch in batches for move in self._moves_of(batch, signals, columns)]
+        incoming = {link.target: link for link in self._system.links}
+        moves = [move for batch in batches for move in self._moves_of(batch, incoming, signals, columns)]
         return moves, lambda: dict(zip(columns, signals))
 
-    def _moves_of(self, batch: Sequence[Node], signals: Values, columns: dict[Node, int]) -> Iterator[Move]:
+    def _moves_of(
+        self, batch: Sequence[Node], incoming: Mapping[Node, Link], signals: Values, columns: dict[Node, int]
+    ) -> Iterator[Move]:
         """Yield components and functions that read a batch's outputs, or set inputs from earlier outputs."""
-        incoming = {link.target: link for link in self._system.links}
         for element, instance in self._instances.items():
             own = [node for node in batch if node.element == element]
             variables = self._system.components[element].variables
