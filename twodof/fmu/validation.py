@@ -5,7 +5,7 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -110,22 +110,28 @@ def problems_of_times(root: ET.Element) -> list[str]:
 
 
 def _check_texts(root: ET.Element) -> None:
-    """Raise ValueError for long texts of variables, types and units, of which each use or element has a copy.
-
-    A description is cut, and the start value of a scalar String has any length.
-    """
+    """Raise ValueError for long texts of variables, types and units that others share, and many display units."""
     for path in ("UnitDefinitions//*", "TypeDefinitions//*", "ModelVariables//*"):
         for each in root.iterfind(path):
-            array = each.find("Dimension") is not None
-            texts = [(key, text) for key, text in each.items() if key != "description" and each.tag != "Start"]
-            texts += [("start", start.get("value", "")) for start in each.findall("Start") if array]
-            for key, text in texts:
-                words = text.split() if array and key == "start" and each.tag != "String" else [text]
-                scalar_string = each.tag == "String" and key == "start" and not array
-                if max(map(len, words), default=0) > MAX_NAME and not scalar_string:
+            for key, text in _shared_texts(each):
+                if len(text) > MAX_NAME:
                     raise ValueError(f"{key} '{text:.40}'… of a <{each.tag}> has more than {MAX_NAME} characters")
             if len(each.findall("DisplayUnit")) > MAX_DISPLAY_UNITS:
                 raise ValueError(f"unit '{each.get('name')}' has more than {MAX_DISPLAY_UNITS} display units")
+
+
+def _shared_texts(each: ET.Element) -> Iterator[tuple[str, str]]:
+    """Yield texts that each use of a type or unit, or each element of an array, reads or copies.
+
+    Descriptions are cut elsewhere, and the start value of a scalar String belongs to it alone.
+    """
+    array = each.find("Dimension") is not None
+    for key, text in each.items():
+        if key == "start" and array:
+            yield from ((key, word) for word in text.split())
+        elif key != "description" and each.tag != "Start" and (each.tag, key) != ("String", "start"):
+            yield key, text
+    yield from (("start", start.get("value", "")) for start in each.findall("Start") if array)
 
 
 def _check_arrays(root: ET.Element) -> None:
