@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from math import inf
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from .reference_runs import KINDS, Reference, Values
 from .system_instance import instantiate_fmu
 
 Rows = NDArray[np.float64]
+T = TypeVar("T")
 NANOSECONDS = 1_000_000_000
 
 
@@ -39,7 +40,7 @@ def _starts(fmu: Fmu, reference: Reference) -> Values:
     return {name: KINDS[fmu.variables[name].type](value) for name, value in values.items()}
 
 
-def _by_type(fmu: Fmu, *functions: Callable[..., Any]) -> Callable[[str], Callable[..., Any]]:
+def _by_type(fmu: Fmu, *functions: Callable[..., T]) -> Callable[[str], Callable[..., T]]:
     """Return a choice, by a variable's name, among functions for the types in KINDS."""
     own = dict(zip(KINDS, functions))
     return lambda name: own[fmu.variables[name].type]
