@@ -45,9 +45,9 @@ static void joint_motions(const JointPosition joint[N_BODIES], const double v[N_
                               .R = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}}};
     double x[3];
     for (int i = 0; i < N_BODIES; i++) {
-        const double turned[3] = {joint[i].c, joint[i].s, 0.0}, slid[3] = {1.0, 0.0, joint[i].c};
+        const double revolute[3] = {joint[i].c, joint[i].s, 0.0}, slid[3] = {1.0, 0.0, joint[i].c};
         const JointMotion *before = PARENT[i] < 0 ? &root : &motion[PARENT[i]];
-        joint_frame(&FRAME[i], FRAME[i].ratio[1] == 0.0 ? turned : slid, before, &motion[i]);
+        joint_frame(&FRAME[i], FRAME[i].ratio[1] == 0.0 ? revolute : slid, before, &motion[i]);
     }
     for (int k = 0; k < 3; k++)
         x[k] = motion[END_BODY].origin[k] + dot_of(motion[END_BODY].R[k], END_P, 3);
@@ -111,9 +111,9 @@ static void add_force(const double f[3], const JointMotion motion[N_BODIES], Mat
 {
     for (int j = END_BODY; j >= 0; j = PARENT[j]) {
         const double *z = motion[j].s;
-        const double turned[3] = {f[1] * z[2] - f[2] * z[1], f[2] * z[0] - f[0] * z[2], f[0] * z[1] - f[1] * z[0]};
+        const double moment[3] = {f[1] * z[2] - f[2] * z[1], f[2] * z[0] - f[0] * z[2], f[0] * z[1] - f[1] * z[0]};
         for (int i = END_BODY; i >= j; i = PARENT[i]) {
-            const double turn = dot_of(turned, &motion[i].s[3], 3);
+            const double turn = dot_of(moment, &motion[i].s[3], 3);
             slope[LEADER[i]][LEADER[j]] += turn;
             if (i != j)
                 slope[LEADER[j]][LEADER[i]] += turn;
@@ -215,16 +215,16 @@ static void add_free_parameters(const Plant *plant, const Stops *stops, const do
 /* Add ∂(Jᵀ f) of the external force by q and f to slope; return false if that by q is 0. */
 static int add_external_force(const double f[3], const JointMotion motion[N_BODIES], double slope[X][N_JOINTS])
 {
-    Matrix turned = {{0}};
+    Matrix rotated = {{0}};
     for (int i = END_BODY; i >= 0; i = PARENT[i])
         for (int k = 0; k < 3; k++)
             slope[F_EXT + k][LEADER[i]] += motion[i].s[3 + k];
     if (f[0] == 0.0 && f[1] == 0.0 && f[2] == 0.0)
         return 0;
-    add_force(f, motion, turned);
+    add_force(f, motion, rotated);
     for (int i = 0; i < N_JOINTS; i++)
         for (int k = 0; k < N_JOINTS; k++)
-            slope[Q + k][i] += turned[i][k];
+            slope[Q + k][i] += rotated[i][k];
     return 1;
 }
 

@@ -41,8 +41,8 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
                    call_name(call), (unsigned long)vr[i]);
             return 0;
         }
-        const int place = begin_of(vr[i]);
-        const Type actual = place >= FIRST_BOOLEAN ? BOOLEAN : place >= FIRST_INTEGER ? INTEGER : REAL;
+        const int index = begin_of(vr[i]);
+        const Type actual = index >= FIRST_BOOLEAN ? BOOLEAN : index >= FIRST_INTEGER ? INTEGER : REAL;
         if (actual != type) {
             report(instance, ERROR, "%s: %s is of type %s", call_name(call),
                    VARIABLE_NAME[begin_of(vr[i])], TYPE_NAME[actual]);

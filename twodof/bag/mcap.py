@@ -78,7 +78,7 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
     If records repeat periodically, as in most bags of ROS 2, all of them are read at once. One by one, each would take
     a microsecond.
     """
-    position = patience = 0
+    position = skips = 0
     seen: dict[bytes, int] = {}  # different headers of the latest message records, and their offsets
     waiting: dict[bytes, list[int]] = {}  # offsets by header
     every = np.frombuffer(chunk, np.uint8)
@@ -101,7 +101,7 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
             seen = {}
             budget.spend(TEXT * length)
             tables.add(path, opcode, chunk, position + HEAD.size)
-        elif opcode == MESSAGE and head in seen and not patience:
+        elif opcode == MESSAGE and head in seen and not skips:
             turn = [offset for offset in seen.values() if offset >= seen[head]]
             rows = _turns(every[turn[0] :], [offset - turn[0] for offset in turn], position - turn[0])[1:]
             seen = {}
@@ -112,11 +112,11 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
                     yield tables.batch(path, rows[:, offset - turn[0] :])
                 position += rows.size
                 continue
-            patience = FEW  # each search takes 20 µs
+            skips = FEW  # each search takes 20 µs
         if opcode == MESSAGE:
             waiting.setdefault(head, []).append(position)
-            if patience:
-                patience -= 1
+            if skips:
+                skips -= 1
             else:
                 seen[head] = position
         position = end

@@ -241,8 +241,8 @@ class Recording:
         with self._fitting():
             columns = self._inputs.columns(names)
         # a change has no effect yet at its own communication point
-        places = [np.maximum(np.searchsorted(begins, self.steps) - 1, 0) for begins, _ in columns]
-        return np.column_stack([values[place] for (_, values), place in zip(columns, places)])
+        indexes = [np.maximum(np.searchsorted(begins, self.steps) - 1, 0) for begins, _ in columns]
+        return np.column_stack([values[index] for (_, values), index in zip(columns, indexes)])
 
     def errors(self) -> dict[str, tuple[Array, Array]]:
         """Return the targets up to each sample and the magnitudes of the errors, m or rad, of "x", "quat" and "q"."""

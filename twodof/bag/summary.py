@@ -137,11 +137,11 @@ def _chunk(path: Path, record: bytes) -> Chunk:
     offsets = record[CHUNK_FIELDS.size : CHUNK_FIELDS.size + size]
     (index_size,) = INDEX_SIZE.unpack_from(record, CHUNK_FIELDS.size + size)
     begin = offset + length
-    indexes = sorted((place, number) for number, place in struct.iter_unpack("<HQ", offsets))
+    indexes = sorted((index_offset, number) for number, index_offset in struct.iter_unpack("<HQ", offsets))
     counts, end = dict[int, int](), begin + index_size
-    for place, number in reversed(indexes):
-        counts[number] = (end - place - INDEX_HEAD) // INDEX_ENTRY
-        if counts[number] < 0 or place < begin:
+    for index_offset, number in reversed(indexes):
+        counts[number] = (end - index_offset - INDEX_HEAD) // INDEX_ENTRY
+        if counts[number] < 0 or index_offset < begin:
             raise DamageError(f"'{path.name}' has a damaged summary")
-        end = place
+        end = index_offset
     return Chunk(first, last, offset, length, begin + index_size, counts)

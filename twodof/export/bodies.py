@@ -73,7 +73,7 @@ class FreeLink:
         body: index of the joint that moves it.
         R, p: pose of its frame in Pinocchio's frame of this joint.
         given: its values in the URDF, in its own frame.
-        free: the same values with variables in the place of those that vary.
+        free: the same values with variables instead of those that vary.
     """
 
     body: int

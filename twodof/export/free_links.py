@@ -30,9 +30,9 @@ def free_links(urdf: Urdf, robot: Robot, patterns: Sequence[str]) -> tuple[list[
     In C, the values are the elements of an array ``link``.
     """
     links: dict[str, FreeLink] = {}
-    for name, body, place, inertia in zip(*moving_links(urdf, robot.model)):
+    for name, body, pose, inertia in zip(*moving_links(urdf, robot.model)):
         given = Inertial(inertia.mass, inertia.lever, inertia.inertia)
-        links[name] = FreeLink(body, place.rotation, place.translation, given, given)
+        links[name] = FreeLink(body, pose.rotation, pose.translation, given, given)
     chosen = _chosen(urdf, [f"{group}:{name}" for group in OF_LINKS for name in links], patterns)
     table: list[Variable] = []
     for group in OF_LINKS:
@@ -64,7 +64,7 @@ def _inputs(group: str, link: str, given: Inertial) -> list[Variable]:
 
 
 def _varied(inertial: Inertial, group: str, values: list[Expression]) -> Inertial:
-    """Return the inertia with the values of a group in the place of its own."""
+    """Return the inertia with the values of a group instead of its own."""
     if group == "mass":
         return inertial._replace(mass=values[0])
     if group == "com":

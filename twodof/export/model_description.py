@@ -70,8 +70,8 @@ def model_description(
     reference = {name: str(i) for i, name in enumerate(dict.fromkeys(names), start=1)}
     table, names = [v for v in table if v.shown], [name for name, v in zip(names, table) if v.shown]
     references = [reference[name] for name in names]
-    place = reference if fmi == 3 else {name: str(i) for i, name in enumerate(names, start=1)}
-    places = [place[name] for name in names]
+    index = reference if fmi == 3 else {name: str(i) for i, name in enumerate(names, start=1)}
+    indexes = [index[name] for name in names]
     attributes = {
         "fmiVersion": f"{fmi}.0",
         "modelName": options.name,
@@ -103,7 +103,7 @@ def model_description(
     _variables(root, robot, table, names, references, flavour)
     if options.clocked:
         _clock(root, table, len(reference) + 1)
-    add_structure(root, robot, table, places, law, fmi)
+    add_structure(root, robot, table, indexes, law, fmi)
     if fmi == 3:
         annotations = ET.SubElement(root, "Annotations")
         _describe(ET.SubElement(annotations, "Annotation", type=VENDOR), robot, options.control)

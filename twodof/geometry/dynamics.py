@@ -93,10 +93,10 @@ class Dynamics:
             at, w, dw, acceleration = links[joint.child]
             force, moment = forces[joint.child], moments[joint.child]
             for mass, com, inertia in self._bodies[joint.child]:
-                c, turned = rotated(at.rotation, com), at.rotation @ inertia @ at.rotation.transpose(0, 2, 1)
+                c, I_world = rotated(at.rotation, com), at.rotation @ inertia @ at.rotation.transpose(0, 2, 1)
                 push = mass * (acceleration + _swung(dw, w, c) - self._gravity)
                 force = force + push
-                moment = moment + rotated(turned, dw) + np.cross(w, rotated(turned, w)) + np.cross(c, push)
+                moment = moment + rotated(I_world, dw) + np.cross(w, rotated(I_world, w)) + np.cross(c, push)
             column, ratio, _ = self._kinematics.column(joint)
             if column is not None:
                 tau[:, column] += ratio * (z * (force if joint.prismatic else moment)).sum(axis=1)

@@ -291,8 +291,8 @@ def _mesh(shape: Shape) -> tuple[dict[str, object], bytes]:
     low = shape.vertices.min(axis=0)
     size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-9)
     grains = np.round((shape.vertices - low) / size * GRAIN).astype("<u2")
-    vertices, place = np.unique(grains, axis=0, return_inverse=True)
-    triangles = place.reshape(-1)[shape.triangles]
+    vertices, index = np.unique(grains, axis=0, return_inverse=True)
+    triangles = index.reshape(-1)[shape.triangles]
     whole = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     content = vertices.astype("<u2").tobytes()
     content += bytes(-len(content) % 4) + whole.astype("<u4").tobytes()

@@ -211,9 +211,9 @@ class Loop:
                 "noted": self._noted,
             }
 
-    def _obey(self, patience: float = 0.0) -> None:
+    def _obey(self, timeout: float = 0.0) -> None:
         with self._lock:
-            if not self._lock.wait_for(lambda: self._orders, patience):
+            if not self._lock.wait_for(lambda: self._orders, timeout):
                 return
             order, number, values = self._orders.popleft()
         if order == "change":

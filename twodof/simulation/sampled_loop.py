@@ -24,11 +24,13 @@ def spectral_radius(Kp: float, Kd: float, period: float, delay: float, *, differ
     part = delay - whole * period
     step = np.zeros((4 + whole, 4 + whole))
     command = np.zeros(4 + whole)
-    place = float(Kp != 0.0)
-    command[:3] = (-Kp - Kd / period, 0.0, place * Kd / period) if differences else (-Kp, -Kd, 0.0)
+    has_position = float(Kp != 0.0)
+    command[:3] = (-Kp - Kd / period, 0.0, has_position * Kd / period) if differences else (-Kp, -Kd, 0.0)
     oldest, next_one = np.eye(4 + whole)[3 + whole], command if whole == 0 else np.eye(4 + whole)[2 + whole]
     rest = period - part
-    step[0] = [place, period, *[0.0] * (2 + whole)] + oldest * (part * rest + part**2 / 2) + next_one * rest**2 / 2
+    step[0] = (
+        [has_position, period, *[0.0] * (2 + whole)] + oldest * (part * rest + part**2 / 2) + next_one * rest**2 / 2
+    )
     step[1] = [0.0, 1.0, *[0.0] * (2 + whole)] + oldest * part + next_one * rest
     step[2, 0], step[3] = 1.0, command
     step[4:, 3:-1] = np.eye(whole)

@@ -34,14 +34,14 @@ def ranks(values: Array) -> NDArray[np.int64]:
 
     NaN has the last rank.
     """
-    distinct, place = np.unique(values, return_inverse=True)
+    distinct, index = np.unique(values, return_inverse=True)
     begins, most = [], -inf
     for value in distinct.tolist():
         begins.append(value > most)  # NaN never begins a rank
         if begins[-1]:
             most = value + ROUNDING * max(1.0, abs(value))
     rank: NDArray[np.int64] = np.cumsum(begins, dtype=np.int64) - 1 + np.isnan(distinct)
-    return rank[place]
+    return rank[index]
 
 
 def beyond_limits(table: pandas.DataFrame) -> pandas.Series:
