@@ -51,6 +51,8 @@ LIBRARIES = {
     "imageio_ffmpeg": {"plots"},
     "matplotlib": {"plots"},
     "pandas": {"sweeps", "bag", "plots", "pages", "cli"},  # tables: made, of a recording, drawn, shown, printed
+    "pathsim": {"fmu"},
+    "pathsim_fmi": {"fmu"},
     "pinocchio": {"plant", "identification"},  # its regressors
     "plotly": {"plots"},
     "pyarrow": {"sweeps", "bag"},

@@ -51,6 +51,7 @@ DISCRETE = """<ScalarVariable name="k" valueReference="7" causality="input" vari
 <ScalarVariable name="b" valueReference="8" causality="parameter" variability="fixed"><Boolean start="false"/>
 </ScalarVariable></ModelVariables>"""
 ALSO_INDEX = '<Unknown index="4"/>', '<Unknown index="4"/><Unknown index="6"/>'
+MODEL_EXCHANGE = re.sub("<CoSimulation.*?/>", '<ModelExchange modelIdentifier="F"/>', DESCRIPTION, flags=re.DOTALL)
 FAULTS = {
     "KEEPS": ("reset", "after a reset: y is"),
     "SHARES": ("two instances", "beside a second instance: y is"),
@@ -334,7 +335,7 @@ def test_a_description_with_problems_fails(tmp_path: Path) -> None:
     outcomes = {row.name: (row.outcome, row.text) for row in check.rows}
     assert outcomes.pop("description")[0] == "failed"
     assert {*outcomes} == {*TRIALS}
-    assert {*outcomes.values()} == {("does not apply", "it was not run, because its description cannot be read")}
+    assert {*outcomes.values()} == {("does not apply", "it was not run; the row of its description has the reason")}
 
 
 def test_a_step_that_is_too_small_is_not_run(tmp_path: Path) -> None:
@@ -413,6 +414,47 @@ def test_only_connections_that_ssp_forbids_fail(start: str, end: str, text: str,
     structure = ssd(f"<ssd:Elements>{component('pd')}</ssd:Elements><ssd:Connections>{wire}</ssd:Connections>")
     row = twodof.check(loop(tmp_path / "loop.ssp", b"", pd_fmu(), structure)).rows[0]
     assert text in row.text and row.outcome == ("remark" if "loop" in text else "failed")
+
+
+@pytest.mark.parametrize("by", ["system", "FMU"])
+def test_a_model_exchange_component_is_a_remark_and_the_other_fmus_are_checked(by: str, tmp_path: Path) -> None:
+    """The system states the implementation, or the FMU has no other one."""
+    stated = component("pd").replace("source=", 'implementation="ModelExchange" source=')
+    elements = f"{component('own')}{stated if by == 'system' else component('pd')}"
+    structure = ssd(f"<ssd:Elements>{elements}</ssd:Elements>")
+    own = {"resources/own.fmu": foreign(tmp_path).read_bytes()}
+    form = DESCRIPTION if by == "system" else MODEL_EXCHANGE
+    check = twodof.check(
+        loop(tmp_path / "loop.ssp", b"", foreign(tmp_path, description=form).read_bytes(), structure, **own)
+    )
+    rows = {row.name: row for row in check.rows}
+    assert rows["structure"].outcome == "remark" and check.passed, check
+    assert rows["own: reset"].outcome == "passed"
+    if by == "system":
+        assert "component 'pd' is a Model Exchange FMU; a co-simulation FMU is needed" in rows["structure"].text
+        assert rows["pd: reset"].outcome == "passed"  # its FMU has both
+    else:
+        assert (
+            rows["pd: description"].outcome == "remark" and "is FMI 2.0 model exchange" in rows["pd: description"].text
+        )
+        assert rows["pd: reset"].outcome == "does not apply"
+
+
+@pytest.mark.parametrize("feature", ["package", "dictionary", "parameters"])
+def test_a_feature_that_no_run_has_is_a_remark(feature: str, tmp_path: Path) -> None:
+    other, own, top = "", "", ""
+    if feature == "package":
+        other = '<ssd:Component name="other" type="application/x-ssp-package" source="resources/other.ssp"/>'
+    elif feature == "dictionary":
+        top = '<ssd:SignalDictionaries><ssd:SignalDictionary name="bus" source="bus.ssb"/></ssd:SignalDictionaries>'
+    else:
+        bound = '<ssd:ParameterBinding source="set.ssv" sourceBase="component"/>'
+        own = f"<ssd:ParameterBindings>{bound}</ssd:ParameterBindings>"
+    structure = ssd(f"<ssd:Elements>{component('pd', own)}{other}</ssd:Elements>{top}")
+    rows = {row.name: row for row in twodof.check(loop(tmp_path / "loop.ssp", b"", pd_fmu(), structure)).rows}
+    texts = {"package": "of type", "dictionary": "signal dictionaries", "parameters": "a parameter file inside its FMU"}
+    assert rows["structure"].outcome == "remark" and texts[feature] in rows["structure"].text
+    assert rows["pd: reset"].outcome == "passed"
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from twodof.errors import BuildError, FmuError, InputError, SimulationError
 from twodof.export.compiler import UNITS
 from twodof.fmu import checking
 from twodof.fmu.description import load_any_fmu
-from twodof.fmu.importers import in_this_master
+from twodof.fmu.importers import TOOLS, in_this_master
 from twodof.fmu.reference_runs import Reference, references_of
 from twodof.fmu.wiring import units_of
 
@@ -35,6 +35,12 @@ FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
 MANIFEST = f"{FOLDER}fmi-ls-manifest.xml"
 EXPERIMENTS = ("move", "push", "sample", "rest")
 DOWN = {"gravity": (0.0, -9.81, 0.0)}
+NEEDED = {
+    "libcosim": ("libcosimpy", "libatomic"),
+    "ecos": ("ecospy", "tbb"),
+    "fmuloader": ("fmuloader",),
+    "pathsim": ("pathsim",),
+}
 ALL_PASSED = {f"reference {name}": "passed" for name in EXPERIMENTS}
 
 
@@ -355,11 +361,10 @@ def test_another_compiler_gives_results_within_the_tolerance(changed: Changed) -
     assert {row.outcome for row in found.values()} == {"passed"}, found
 
 
-@pytest.mark.parametrize("tool", ["fmpy", "libcosim"])
+@pytest.mark.parametrize("tool", TOOLS)
 def test_another_tool_meets_them(tool: str, built: Path) -> None:
-    if tool == "libcosim":
-        needs("libcosimpy")
-        needs("libatomic")
+    for name in NEEDED.get(tool, ()):
+        needs(name)
     found = rows(built, tool)
     assert [row.outcome for row in found.values()] == ["passed"] * 8 and f"reference push with {tool}" in found
 
@@ -472,12 +477,14 @@ def with_references(fmu: bytes, files: dict[str, str], path: Path) -> Path:
     return packed({**members(path), **{FOLDER + name: text.encode() for name, text in texts.items()}}, path)
 
 
-@pytest.mark.parametrize("tool", ["fmpy", "libcosim"])
+@pytest.mark.parametrize("tool", TOOLS)
 def test_stimuli_and_results_may_be_truth_values_and_whole_numbers(tool: str, tmp_path: Path) -> None:
-    """A controller is disabled by a Boolean, and by a number of steps, after 5 of 10 steps."""
-    if tool == "libcosim":
-        needs("libcosimpy")
-        needs("libatomic")
+    """A controller is disabled by a Boolean, and by a number of steps, after 5 of 10 steps.
+
+    PathSim has no such inputs, and fmuloader needs Model Exchange.
+    """
+    for name in NEEDED.get(tool, ()):
+        needs(name)
     values = '<Parameter name="enabled"><Boolean value="1"/></Parameter>'
     stimuli = {"enabled": ("true", "false"), "seen": ("0", "30")}
     experiments = "".join(
@@ -494,7 +501,9 @@ def test_stimuli_and_results_may_be_truth_values_and_whole_numbers(tool: str, tm
         files[f"{name}.csv"] = f"time,{name}\n0,{first}\n0.04,{first}\n0.05,{last}\n"
     files["results.csv"] = "time,tau[1],steps\n" + results
     found = rows(with_references(pd_fmu(), files, tmp_path / "pd.fmu"), tool)
-    assert [(row.outcome, row.text[:9]) for row in found.values()] == [("passed", "20 values")] * 4, found
+    others = tool in ("fmuloader", "pathsim")
+    theirs = ("does not apply", f"{tool} runs"[:9]) if others else ("passed", "20 values")
+    assert [(row.outcome, row.text[:9]) for row in found.values()] == [("passed", "20 values"), theirs] * 2, found
 
 
 def of_controller(files: dict[str, str], path: Path, times: str = "", fmu: bytes | None = None) -> Path:

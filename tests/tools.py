@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import platform
@@ -36,6 +37,15 @@ class Tool(NamedTuple):
     """Presence on this machine, of what is not a program."""
 
 
+def loads(library: str) -> bool:
+    """Return whether the dynamic linker finds a library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
 def named() -> bool:
     """Return whether the machine's own name has an address."""
     try:
@@ -53,7 +63,9 @@ TOOLS = {
     "disks": Tool("full disks", names=("mount",), remedy="run as root, where tmpfs can be mounted"),
     "fastdds": Tool("ROS 2 networks with Fast DDS", "libfastrtps-dev", ("/usr/include/fastdds/dds",)),
     "fastddsgen": Tool("ROS 2 networks with Fast DDS", "fastddsgen"),
+    "ecospy": Tool("FMUs in ecos", remedy="pip install ecospy", module="ecospy"),
     "eslint": Tool("rules of the pages' scripts", names=(str(NODE / ".bin" / "eslint"),), remedy=INSTALL),
+    "fmuloader": Tool("FMUs in fmuloader", remedy="use Python 3.11 or newer", module="fmuloader"),
     "foxglove": Tool("Foxglove's own client", names=(str(NODE / "@foxglove"),), remedy=INSTALL),
     "g++": Tool("ROS 2 networks with Fast DDS", "g++", ("g++", "c++")),
     "gcc": Tool("the engine's inner functions in C", "gcc", ("gcc", "cc", "clang")),
@@ -74,9 +86,11 @@ TOOLS = {
     "nm": Tool("the symbols of libraries", "binutils"),
     "npm": Tool("Foxglove's own client", "npm"),
     "openssl": Tool("clusters with keys", "openssl"),
+    "pathsim": Tool("FMUs in PathSim", remedy="pip install pathsim-fmi", module="pathsim_fmi"),
     "qemu": Tool("libraries for ARM", "qemu-user", ("qemu-aarch64", "qemu-aarch64-static")),
     "root": Tool("files of another user", remedy="run as root", here=os.geteuid() == 0),
     "strace": Tool("the order of writes to a disk", "strace"),
+    "tbb": Tool("FMUs in ecos", "libtbb12", here=loads("libtbb.so.12")),
     "tsc": Tool("types in the pages' scripts", "node-typescript"),
     "valgrind": Tool("memory errors", "valgrind"),
     "wine": Tool("libraries for Windows", "wine64", ("wine64", "wine", "/usr/lib/wine/wine64")),

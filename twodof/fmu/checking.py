@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
@@ -79,7 +80,7 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
     Args:
         fmu: an FMI 2.0 or 3.0 co-simulation FMU with a binary for this machine; or an SSP 1.0 file, each of whose FMUs
             is checked.
-        tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos" or "fmuloader".
+        tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos", "fmuloader" or "pathsim".
 
     Raises:
         FmuError: the file is missing, is not an FMU, is unsafe to unzip, or has no co-simulation.
@@ -109,11 +110,11 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
     problems[MOST_PROBLEMS:] = [f"and {len(problems) - MOST_PROBLEMS} more"] * (len(problems) > MOST_PROBLEMS)
     try:
         known = load_any_fmu(path, inside)
-    except FmuError:
-        if not problems:
+    except FmuError as error:
+        if not problems and not inside:
             raise
-        yield Row("description", "failed", "; ".join(problems))
-        reason = "it was not run, because its description cannot be read"
+        yield Row("description", *(("failed", "; ".join(problems)) if problems else ("remark", f"{error}")))
+        reason = "it was not run; the row of its description has the reason"
         yield from (Row(name, "does not apply", reason) for name in TRIALS)
         return
     described = f"{len(known.variables)} variables, FMI {known.description.fmiVersion}"
@@ -183,6 +184,7 @@ def _serve(pipe: Connection, path: Path, inside: str, tasks: Sequence[_Task], fo
     """Do the trials in the child, in a folder; send the name of each call before it, and each result."""
     limit(MAX_CHECK_MEMORY)
     os.chdir(folder)
+    os.environ["TMPDIR"] = tempfile.tempdir = str(folder)  # tools leave files there
 
     def send(*words: str) -> None:
         pipe.send_bytes(json.dumps(words).encode()[:MAX_ROW])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from math import inf
 from typing import TypeVar
@@ -14,6 +15,7 @@ from ..errors import InputError, choice
 from .description import Fmu
 from .reference_runs import KINDS, Reference, Values
 from .system_instance import instantiate_fmu
+from .trial import UnpassedError
 
 Rows = NDArray[np.float64]
 T = TypeVar("T")
@@ -121,6 +123,8 @@ def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     """Run the stimuli by calls of fmuloader."""
     from fmuloader.fmi2 import Fmi2Slave, Fmi2Type
 
+    if fmu.description.modelExchange is None:
+        raise UnpassedError("does not apply", "fmuloader runs only FMUs that have Model Exchange too")
     slave = Fmi2Slave(str(fmu.path), model_identifier=fmu.description.coSimulation.modelIdentifier)
     slave.instantiate("fmu", Fmi2Type.CO_SIMULATION, guid=fmu.guid)
     write = _by_type(fmu, slave.set_real, slave.set_integer, slave.set_boolean)
@@ -142,12 +146,35 @@ def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     return rows
 
 
+def in_pathsim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
+    """Run the stimuli by PathSim's block of an FMU, whose inputs are constants."""
+    from pathsim import Connection, Simulation
+    from pathsim.blocks import Constant
+    from pathsim_fmi import CoSimulationFMU
+
+    inputs = {name: v.start_value for name, v in fmu.variables.items() if v.causality == "input"}
+    if reference.start or any(fmu.variables[name].type != "Real" for name in inputs):
+        raise UnpassedError("does not apply", "pathsim runs FMUs with real inputs alone, and from 0 s")
+    block = CoSimulationFMU(str(fmu.path), start_values=_starts(fmu, reference), dt=reference.step)
+    sources = {name: Constant(reference.inputs(0).get(name, value)) for name, value in inputs.items()}
+    wires = [Connection(source, block[name]) for name, source in sources.items()]
+    simulation = Simulation([block, *sources.values()], wires, dt=reference.step, log=False)
+    read = partial(block.fmu_wrapper.get_real, [fmu.variables[name].reference for name in names])
+
+    def change(values: Values) -> None:
+        for name, value in values.items():
+            sources[name].value = value
+
+    return reference.rows(change, lambda t, h: simulation.timestep(h), read)
+
+
 Run = Callable[[Fmu, Reference, Sequence[str]], Rows]
 TOOLS: dict[str, tuple[str, Run, str]] = {
     "fmpy": ("fmpy", in_fmpy, "23"),
     "libcosim": ("libcosimpy", in_libcosim, "2"),
     "ecos": ("ecospy", in_ecos, "23"),
     "fmuloader": ("fmuloader", in_fmuloader, "2"),
+    "pathsim": ("pathsim_fmi", in_pathsim, "2"),
 }
 """Python packages of the tools, functions that run them, and the versions of FMI with which they are tried."""
 

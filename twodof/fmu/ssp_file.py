@@ -107,6 +107,7 @@ class Element:
 
     Attributes:
         source: member of the archive with the component's FMU; "" for a system.
+        unsupported: messages about valid features for which no run is made.
         children, connections: elements inside a system, and its connections as XML elements.
     """
 
@@ -116,6 +117,7 @@ class Element:
     source: str = ""
     children: list[Element] = field(default_factory=list)
     connections: list[ET.Element] = field(default_factory=list)
+    unsupported: list[str] = field(default_factory=list)
 
     def walk(self) -> Iterator[Element]:
         """Yield all elements, each system after the elements inside it."""
@@ -194,19 +196,23 @@ class _File:
             unit, of = ("", "") if kind is None else (kind.get("unit", ""), kind.tag.removeprefix(SSC))
             facts = connector.get("kind", ""), units.get(unit, Unit(unit)), of
             connectors[connector.get("name", "")] = Connector(*facts)
-        bindings = xml.iterfind(f"{SSD}ParameterBindings/{SSD}ParameterBinding")
-        parameters = [parameter for binding in bindings for parameter in self._bound(binding, name)]
+        bindings = xml.findall(f"{SSD}ParameterBindings/{SSD}ParameterBinding")
+        far = [b for b in bindings if any(each.get("sourceBase", "SSD") != "SSD" for each in b.iter())]
+        parameters = [parameter for b in bindings if b not in far for parameter in self._bound(b, name)]
         element = Element(name, connectors, parameters)
+        if far:
+            element.unsupported.append(f"'{name}' has a parameter file inside its FMU: not supported")
         if xml.tag == f"{SSD}Component":
             form = xml.get("type", "")
             if form not in FMU_TYPES or xml.get("implementation") == "ModelExchange":
                 what = "a Model Exchange FMU" if form in FMU_TYPES else f"of type {form}"
-                raise FmuError(f"'{self._path}': component '{name}' is {what}; a co-simulation FMU is needed")
-            element.source = self._member(xml.get("source", ""), name)
+                element.unsupported.append(f"component '{name}' is {what}; a co-simulation FMU is needed")
+            if form in FMU_TYPES:
+                element.source = self._member(xml.get("source", ""), name)
             return element
         for feature in ("SignalDictionaries", f"Elements/{SSD}SignalDictionaryReference"):
             if xml.find(f"{SSD}{feature}") is not None:
-                raise FmuError(f"'{self._path}': system '{name or 'of all'}' has signal dictionaries: not supported")
+                element.unsupported.append(f"system '{name or 'of all'}' has signal dictionaries: not supported")
         for child in xml.iterfind(f"{SSD}Elements/*"):
             own = f"{name}.{child.get('name')}" if name else child.get("name", "")
             element.children.append(self.element(child, own, units))
@@ -260,8 +266,6 @@ class _File:
         root = None if inline is None else next((c for c in inline if c.tag.startswith(namespace)), None)
         if root is not None:
             return self._checked(ET.tostring(root), f"an inline set of '{name}'", kind)
-        if xml.get("sourceBase", "SSD") != "SSD":
-            raise FmuError(f"'{self._path}': '{name}' has a parameter file inside its FMU: not supported")
         return self.xml(self._member(xml.get("source", ""), name or "the system"), kind)
 
 

@@ -110,6 +110,8 @@ def load_system(path: Path, robot: str = "") -> System:
         FmuError: a feature, component or connection is invalid; the message names it.
     """
     title, top, times, structure = read_ssp(path)
+    if unsupported := next((text for element in top.walk() for text in element.unsupported), ""):
+        raise FmuError(f"'{path}': {unsupported}")
     fmus: dict[str, Fmu] = {}
     by_source: dict[str, Fmu] = {}
     room, free, files = MAX_DESCRIPTIONS, MAX_VARIABLES, MAX_FILES
