@@ -131,6 +131,21 @@ def indexed(index: bytes) -> bytes:
     return body + summary + foot + struct.pack("<I", crc32(foot, crc32(summary))) + b"\x89MCAP0\r\n"
 
 
+def with_empty_chunks(count: int) -> bytes:
+    """An MCAP file of one message and of empty chunks, which all 999 channels of one topic could be in."""
+    content = SCHEMA + CHANNEL + message(nothing(1, 1))
+    used, index = chunk(content, len(content), ""), record(7, struct.pack("<HIQQ", 1, 16, 0, 0))
+    offset = len(HEADER) + len(used)
+    body = HEADER + used + index + bytes(49 * count)
+    indexes = record(8, struct.pack("<QQQQIHQQ", 0, 0, len(HEADER), len(used), 10, 1, offset, len(index)))
+    empty = (struct.pack("<QQQQIQ", 0, 0, offset + len(index) + 49 * i, 49, 0, 0) for i in range(count))
+    same = [channel(i, "/joint_states") for i in range(1, 1000)]
+    total = record(11, struct.pack("<QHIIIIQQI", 1, 1, 1, 0, 0, count + 1, 0, 0, 10), PAIR)
+    summary = b"".join([SCHEMA, *same, indexes, *(record(8, fields) for fields in empty), total])
+    foot = struct.pack("<BQQQ", 2, 20, len(body), 0)
+    return body + summary + foot + struct.pack("<I", crc32(foot, crc32(summary))) + b"\x89MCAP0\r\n"
+
+
 def steered(samples: int, joints: int, changes: int, starts: int) -> Callable[[Path], None]:
     """A bag with many changes of one input."""
 
@@ -268,6 +283,7 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     "5 MB of entries that share their bytes": with_mcap(
         lambda: indexed(record(8, INDEX, struct.pack("<IHQ", 4_000_000, 1, 0)) * 100_000)
     ),
+    "300,000 chunks without messages": with_mcap(lambda: with_empty_chunks(300_000)),
     "texts of a gigabyte in a log": forged_log,
     "60 MB of small records": with_mcap(lambda: mcap_of(record(8) * (7 * MIB))),
     "no topic in CDR": with_sql("UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"),

@@ -17,7 +17,7 @@ import twodof
 from twodof.bag.contents import read_messages
 from twodof.bag.mcap import CHANNEL
 from twodof.bag.records import DamageError, ReadBudget
-from twodof.bag.summary import _chunk, read_summary
+from twodof.bag.summary import McapSummary, _chunk, read_summaries
 from twodof.bounds import MAX_TOPICS
 from twodof.cli.main import main
 
@@ -63,9 +63,22 @@ def seal(file: Path, content: bytearray, start: int) -> None:
     file.write_bytes(content)
 
 
+def read_summary(file: Path) -> McapSummary | None:
+    summaries = read_summaries([file])
+    return None if summaries is None else summaries[0]
+
+
 def without_checksum(file: Path) -> None:
     content = file.read_bytes()
     file.write_bytes(content[:-12] + bytes(4) + content[-8:])
+
+
+def test_summaries_of_all_files_are_limited(bag, monkeypatch):
+    content = file_of(bag).read_bytes()
+    size = len(content) - statistics_of(content)[0] - 37  # without the footer
+    monkeypatch.setattr("twodof.bag.summary.MAX_SUMMARY", 2 * size)
+    assert read_summaries([file_of(bag)] * 2) is not None
+    assert read_summaries([file_of(bag)] * 3) is None
 
 
 def test_summary_is_that_of_the_mcap_project(bag):

@@ -27,7 +27,7 @@ from .joint_states import Ends, JointStates, Targets
 from .provenance import file_of, read_provenance, robot_in, robots_of
 from .recording import Array, Inputs, Recording, TopicCount
 from .records import Channel, DamageError, ReadBudget, Stamps
-from .summary import McapSummary, read_summary
+from .summary import McapSummary, read_summaries
 
 LOG = logging.getLogger(__name__)
 
@@ -65,9 +65,8 @@ def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
     """
     folder, _ = robot_in(paths[0])
     with _refusing(folder):
-        summaries = [read_summary(file) for file in whole_bag(folder)]
-        valid = [summary for summary in summaries if summary is not None]
-        found = [_ends(path, valid) if len(valid) == len(summaries) else None for path in paths]
+        summaries = read_summaries(whole_bag(folder))
+        found = [None if summaries is None else _ends(path, summaries) for path in paths]
     rest = iter(_read([_Robot(path, Ends, None) for path, known in zip(paths, found) if known is None]))
     return [known or next(rest) for known in found]
 

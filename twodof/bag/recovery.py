@@ -33,7 +33,7 @@ from . import provenance
 from .contents import read_messages, stated_count, storage_files
 from .records import Channel, DamageError, ReadBudget
 from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, McapStorage, check_path
-from .summary import read_summary
+from .summary import read_summaries
 
 NO_HASH = "RIHS01_" + "0" * 64  # hash of a type without a known definition
 
@@ -131,15 +131,14 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
     counts: Counter[str] = Counter()
     try:
         stated = stated_count(folder)
-        summaries = [read_summary(file) for file in files]
+        summaries = read_summaries(files)
         budget = ReadBudget()
         for file in files:
             for channel, stamps, _ in read_messages(file, budget):
                 counts[channel.topic] += len(stamps)
     except (OSError, DamageError):
         return None
-    summed = sum(sum(summary.counts.values()) for summary in summaries if summary)
-    totals = {stated, *([] if None in summaries else [summed])}
+    totals = {stated} if summaries is None else {stated, sum(sum(summary.counts.values()) for summary in summaries)}
     return dict(counts) if totals == {counts.total()} else None
 
 

@@ -10,7 +10,7 @@ Source: MCAP's specification. A file without a summary, or without its checksum,
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -28,6 +28,7 @@ STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
 CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the offsets by channel
 OFFSET_SIZE = 10  # of the message index of one channel
 INDEX_SIZE = struct.Struct("<Q")  # of all message indexes of a chunk, which follow it
+SMALLEST_CHUNK = 49  # bytes of a chunk without records
 INDEX_HEAD, INDEX_ENTRY = 15, 16  # bytes of a message index of one channel, besides those of each message
 
 
@@ -58,8 +59,9 @@ class McapSummary:
             DamageError: a chunk is damaged, or not at its stated offset.
             OSError: the file cannot be read.
         """
-        numbers = [n for n, channel in self.channels.items() if channel.topic == topic]
-        having = [(c, count) for c in self.chunks if (count := sum(c.counts.get(n, 0) for n in numbers))]
+        numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
+        counted = ((c, sum(count for n, count in c.counts.items() if n in numbers)) for c in self.chunks)
+        having = [(c, count) for c, count in counted if count]
         soonest = min((max(c.first, c.last) for c, _ in having), default=0)
         latest = max((min(c.first, c.last) for c, _ in having), default=0)
         with self.path.open("rb") as file, refusing_damage(self.path):
@@ -79,27 +81,39 @@ class McapSummary:
                     raise DamageError(f"{where}, and {count} according to its summary")
 
 
-def read_summary(path: Path) -> McapSummary | None:
-    """Return the summary of an MCAP file; None without a valid one."""
+def read_summaries(paths: Iterable[Path]) -> list[McapSummary] | None:
+    """Return the summaries of all MCAP files of a bag; None if one is not valid, or if they are very large together."""
+    summaries, room = list[McapSummary](), MAX_SUMMARY
+    for path in paths:
+        content, start = _bytes_of_summary(path, room)
+        room -= len(content)
+        try:
+            summary = _summary(path, content, start)
+        except (struct.error, UnicodeDecodeError, KeyError, DamageError):
+            return None
+        if summary is None:
+            return None
+        summaries.append(summary)
+    return summaries
+
+
+def _bytes_of_summary(path: Path, most: int) -> tuple[bytes, int]:
+    """Return the summary of a file and its offset; no bytes if its checksum differs or it is larger than ``most``."""
+    none = b"", 0
     size = path.stat().st_size
     if path.suffix != ".mcap" or size < END + len(MAGIC):
-        return None
+        return none
     with path.open("rb") as file:
         file.seek(size - END)
         end = file.read()
         start, _, crc = FOOTER_FIELDS.unpack_from(end, HEAD.size)
         length = size - END - start
         sound = end.endswith(MAGIC) and HEAD.unpack_from(end) == (FOOTER, FOOTER_FIELDS.size)
-        if not sound or not crc or not 0 < start < size - END or length > MAX_SUMMARY:
-            return None
+        if not sound or not crc or not 0 < start < size - END or length > most:
+            return none
         file.seek(start)
         content = file.read(length)
-    if crc32(end[: HEAD.size + 16], crc32(content)) != crc:
-        return None
-    try:
-        return _summary(path, content, start)
-    except (struct.error, UnicodeDecodeError, KeyError, DamageError):
-        return None
+    return (content, start) if crc32(end[: HEAD.size + 16], crc32(content)) == crc else none
 
 
 def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
@@ -132,7 +146,7 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
 def _chunk(path: Path, record: bytes) -> Chunk:
     """Return a chunk from its index record; its message counts follow from the sizes of its message indexes."""
     first, last, offset, length, size = CHUNK_FIELDS.unpack_from(record)
-    if size > MAX_TOPICS * OFFSET_SIZE:
+    if size > MAX_TOPICS * OFFSET_SIZE or length < SMALLEST_CHUNK:
         raise DamageError(f"'{path.name}' has a damaged summary")
     offsets = record[CHUNK_FIELDS.size : CHUNK_FIELDS.size + size]
     (index_size,) = INDEX_SIZE.unpack_from(record, CHUNK_FIELDS.size + size)
