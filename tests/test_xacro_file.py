@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from multiprocessing.connection import Connection
 from pathlib import Path
 from xml.etree.ElementTree import canonicalize
 
@@ -154,6 +155,26 @@ def test_hostile_files_are_refused(package: Path, body: str, message: str, monke
     with pytest.raises(BuildError, match=message) as refusal:
         read_text(path, None)
     assert "\n" not in str(refusal.value) and "hidden" not in str(refusal.value)
+
+
+def test_long_messages_of_a_file_are_cut(package: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The parent process does not receive gigabytes of them."""
+    path = package / "urdf/robot.xacro"
+    warning = "<a b='${xacro.warning(\"w\" * 50000)}'/>" * 100
+    path.write_text(f"<robot xmlns:xacro='http://www.ros.org/wiki/xacro' name='r'>{warning}</robot>")
+    assert 'name="r"' in read_text(path, None)
+    assert 1000 < len(caplog.messages[0]) < 3000
+
+
+def test_an_answer_that_is_no_json_is_refused(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pickle from a process that a file controls would run code here."""
+    monkeypatch.setattr(xacro_file, "_expand", send_a_pickle)
+    with pytest.raises(BuildError, match="cannot expand"):
+        read_text(package / "urdf/arm.urdf.xacro", None)
+
+
+def send_a_pickle(pipe: Connection, *_: object) -> None:
+    pipe.send(("<robot/>", "", ""))
 
 
 def test_a_missing_extra_is_named(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ contain a URDF's meshes. The environment is empty, and memory and time are limit
 import ast
 import errno
 import io
+import json
 import logging
 import os
 import sys
@@ -21,13 +22,15 @@ from subprocess import DEVNULL
 
 from ..bounds import MAX_XACRO_MEMORY, MAX_XACRO_SECONDS, MAX_XACRO_WAIT
 from ..children import Child, confine, limit_time
-from ..errors import BuildError, ChildError
-from ..files import check_file
+from ..errors import BuildError
+from ..files import check_file, fits, parsed
 from ..version import install
 
 LOG = logging.getLogger(__name__)
 ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
 """Audit events without effect outside the process."""
+LONGEST = 6  # bytes of a character in JSON
+MAX_REMARKS = 2000  # characters
 
 
 def expand(path: Path, folders: Sequence[Path], most: int) -> str:
@@ -42,18 +45,34 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
     environment = {"LC_ALL": "C.UTF-8"}
     with Child(_expand, path, folders, most, MAX_XACRO_SECONDS, environment=environment, output=DEVNULL) as child:
         try:
-            if not child.poll(MAX_XACRO_WAIT):
-                raise EOFError(f"it takes more than {MAX_XACRO_WAIT} s")
-            text, remarks = child.recv()
-        except (EOFError, ChildError) as error:
+            answer = parsed(child.receive(LONGEST * (most + 3 * MAX_REMARKS), MAX_XACRO_WAIT))
+        except (EOFError, ValueError, RecursionError) as error:
             raise BuildError(f"cannot expand '{path}': {error}") from error
+    if not fits(answer, (str, str, str)):
+        raise BuildError(f"cannot expand '{path}': the answer of its reader is invalid")
+    text, remarks, failure = answer
+    if failure:
+        raise BuildError(failure[:MAX_REMARKS])
     if remarks:
         LOG.warning("%s: xacro reports: %s", path, " ".join(remarks.split()))
     return str(text)
 
 
 def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, seconds: int) -> None:
-    """Expand the file in the child; send the URDF and the messages of xacro."""
+    """Expand the file in the child; send the URDF, the messages of xacro and a failure, as JSON and never as a pickle.
+
+    The file may control this process once it has found an error in a library that reads it.
+    """
+    remarks, text, failure = io.StringIO(), "", ""
+    try:
+        text = _expanded(path, folders, most, seconds, remarks)
+    except BuildError as error:
+        failure = str(error)
+    pipe.send_bytes(json.dumps([text, remarks.getvalue()[:MAX_REMARKS], failure[:MAX_REMARKS]]).encode())
+
+
+def _expanded(path: Path, folders: Sequence[Path], most: int, seconds: int, remarks: io.StringIO) -> str:
+    """Confine this process and return the URDF."""
     import xacro
     from xacro import substitution_args
 
@@ -68,7 +87,6 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, se
     confine(MAX_XACRO_MEMORY, 2 * seconds, folders)
     limit_time(seconds)  # SIGXCPU, before the kernel's SIGKILL
     sys.addaudithook(_guard(folders, most))
-    remarks = io.StringIO()
     try:
         with redirect_stdout(remarks), redirect_stderr(remarks):
             xacro.init_stacks(str(path))
@@ -79,7 +97,7 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, se
         raise BuildError(f"cannot expand '{path}': {_reason(error)}") from None
     if len(text) > most:
         raise BuildError(f"'{path}' expands to {len(text)} bytes; at most {most} are supported")
-    pipe.send((text, remarks.getvalue()))
+    return str(text)
 
 
 def _reason(error: Exception) -> str:
