@@ -388,6 +388,7 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
         ("push-ref.csv", b"\n0.02,", b"\n0.02,1,", "cannot be read"),
         ("push.ssv", b"ssv:Real", b"ssv:Complex", "is of type Complex, which is not set"),
         ("references.exp", b'"push.ssv"', b'"none.ssv"', "none.ssv"),
+        ("references.exp", b'"push.ssv"', b'"' + b"%2e" * 2000 + b'"', "6000 characters; at most 4096 are supported"),
         ("references.exp", b'"push.ssv"', b'"../../../../etc/passwd"', "etc/passwd"),
         ("references.exp", b"<Experiments", b"<!DOCTYPE x><Experiments", "declares entities"),
         ("references.exp", b'stepSize="0.01"', b'stepSize="0"', "must be a run of at most"),
@@ -424,6 +425,16 @@ def test_the_units_of_an_fmu_are_read_once(built: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("twodof.fmu.reference_runs.units_of", read)
     found = references_of(load_any_fmu(built))
     assert sum(len(reference.parameters) for reference in found) > 1 and read.call_count == 1
+
+
+def test_the_number_of_readings_is_limited(built: Path, tmp_path: Path) -> None:
+    files = members(built)
+    files[FOLDER + "e"] = b"<E/>"
+    again = b'<Related role="experiment" source="e"/>' * 5000
+    tag = next(re.finditer(rb"<\S*Related\b", files[MANIFEST])).start()
+    files[MANIFEST] = files[MANIFEST][:tag] + again + files[MANIFEST][tag:]
+    with pytest.raises(FmuError, match="each as often as it is read, have more than"):
+        references_of(load_any_fmu(packed(files, tmp_path / "again.fmu")))
 
 
 def test_the_cells_of_all_tables_are_limited(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -366,6 +366,17 @@ def test_a_run_in_two_parts_is_refused_before_the_other_runs(native_path, sound,
     assert len([*tmp_path.iterdir()]) == 2
 
 
+def test_the_provenances_of_all_parts_are_limited(sound, tmp_path, monkeypatch):
+    table = described(pq.read_table(sound), "command_line", "x" * 100_000)
+    for i in range(10):
+        store(table.slice(0, 2 * (i == 0)), tmp_path / f"part-{i:06d}.parquet")
+    monkeypatch.setattr("twodof.sweeps.stored_table.MAX_SWEEP", 1_020_000)
+    assert len(read_sweep(tmp_path)) == 2
+    monkeypatch.setattr("twodof.sweeps.stored_table.MAX_SWEEP", 980_000)
+    with pytest.raises(TwoDofError, match=r"part-000009\.parquet': it is damaged"):
+        read_sweep(tmp_path)
+
+
 @pytest.mark.parametrize("picture", ["x.html", "x.png"])
 def test_half_characters_in_a_provenance_are_replaced(sound, tmp_path, picture, capsys):
     half = {"file": "\ud800.fmu", "name": "\udfff", "guid": ""}

@@ -20,7 +20,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_CELLS, MAX_NAME, MAX_REFERENCES
+from ..bounds import MAX_CELLS, MAX_NAME, MAX_PATH, MAX_REFERENCES
 from ..errors import FmuError, SimulationError
 from ..export.typed_values import WHOLE
 from ..files import read_member
@@ -34,6 +34,7 @@ MANIFEST = "extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"
 TIME_TOLERANCE = 1e-6  # fraction of a communication step
 TRUTHS = {"true": "1", "false": "0"}
 MOST_STEPS = 1_000_000
+PER_FILE = 4096  # bytes that each reading of a file counts besides its own
 Values = dict[str, float | bool | int]
 KINDS: dict[str, Callable[[float], float | bool]] = {"Real": float, "Integer": int, "Boolean": bool}
 """Types of values, and functions that convert numbers to them."""
@@ -161,8 +162,12 @@ class _Files:
 
     def read(self, source: str) -> bytes:
         """Return a file by its relative URI."""
+        if len(source) > MAX_PATH:
+            raise ValueError(f"{source:.40}… has {len(source)} characters; at most {MAX_PATH} are supported")
+        if self._room <= 0:
+            raise ValueError(f"their files, each as often as it is read, have more than {MAX_REFERENCES} bytes")
         content = read_member(self._archive, posixpath.normpath(f"{self._folder}/{unquote(source)}"), self._room)
-        self._room -= len(content)
+        self._room -= len(content) + PER_FILE
         found = hashlib.sha3_256(content).hexdigest()
         if self.digests.get(source, found).lower() != found:
             raise ValueError(f"{source} is not the file whose checksum is in {posixpath.basename(MANIFEST)}")

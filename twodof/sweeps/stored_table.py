@@ -94,7 +94,7 @@ def read_tables(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
                 with pq.ParquetFile(file, read_dictionary=TEXTS, **FOOTER) as stored:
                     _check_size(file, stored.metadata, runs, room)
                     table = stored.read(use_threads=False)
-            room -= table.nbytes + sum(_expanded(table.column(name)) for name in TEXTS)
+            room -= len(schema.metadata[KEY]) + table.nbytes + sum(_expanded(table.column(name)) for name in TEXTS)
             if room < 0:
                 raise _damaged(file)
             table.validate(full=True)  # texts may be any bytes
