@@ -70,7 +70,7 @@ def ur5(control: str = "task") -> Arm:
     return spatial_arm(tree, "tool0", (0.0, -1.0, 1.0, 0.3, 1.0, 0.2), control)
 
 
-def chain(n: int) -> Arm:
+def chain(n: int, control: str = "task") -> Arm:
     """Return a chain of rods whose joints rotate alternately about y and z."""
     links = [
         f'<link name="l{i}"><inertial><origin xyz="0.05 0 0"/><mass value="0.5"/>'
@@ -81,7 +81,7 @@ def chain(n: int) -> Arm:
         for i in range(1, n + 1)
     ]
     tree = ET.fromstring(f'<robot name="chain"><link name="l0"/>{"".join(links)}</robot>')
-    return spatial_arm(tree, f"l{n}", (0.2,) * n)
+    return spatial_arm(tree, f"l{n}", (0.2,) * n, control)
 
 
 def spatial_arm(tree: ET.Element, frame: str, q_start: tuple[float, ...], control: str = "task") -> Arm:

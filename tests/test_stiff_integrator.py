@@ -89,17 +89,28 @@ def test_coefficients_satisfy_the_order_conditions_of_a_w_method_and_damp_stiff_
 
 @pytest.mark.parametrize("integrator", [AUTOMATIC, STIFF])
 @pytest.mark.parametrize("damping", [0.1, 10.0, 600.0, 1e4, 1e6])
-def test_damped_arms_move_as_an_implicit_solver_says(damping, integrator):
-    of, changes = engine("twodof"), {"damping": [damping] * 2}
+@pytest.mark.parametrize("v_start", [[0.0, 0.0], [0.5, -0.4]], ids=["at rest", "moving"])
+def test_damped_arms_move_as_an_implicit_solver_says(v_start, damping, integrator):
+    of, changes = engine("twodof"), {"damping": [damping] * 2, "v_start": v_start}
     expected = radau(shipped(of, **changes), STEP)
     found = both(of, shipped(of, **changes, integrator=integrator), 1)
     assert np.abs(found[:2] - expected).max() <= 1e-5
 
 
 @pytest.mark.parametrize("damping", [1.0, 30.0, 100.0, 1e3, 1e5, 1e6])
-def test_a_step_of_a_damped_arm_costs_few_evaluations(damping, monkeypatch):
-    undamped, damped = (shipped(engine("twodof"), damping=[D] * 2) for D in (0.0, damping))
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_a_step_of_a_damped_arm_costs_few_evaluations(speed, damping, monkeypatch):
+    undamped, damped = (shipped(engine("twodof"), damping=[D] * 2, v_start=[speed] * 2) for D in (0.0, damping))
     assert evaluations(damped, monkeypatch) <= 5 * evaluations(undamped, monkeypatch)
+
+
+@pytest.mark.parametrize("damping", [1e4, 1e5, 1e6])
+def test_velocities_that_vanish_within_a_short_time_cost_no_evaluations(damping, monkeypatch):
+    """Integrating their decay took four times the evaluations. Afterwards the damping balances the controller."""
+    changes = {"v_start": [0.5, 0.5]}
+    undamped, damped = (shipped(engine("twodof"), damping=[D] * 2, **changes) for D in (0.0, damping))
+    assert evaluations(damped, monkeypatch) <= evaluations(undamped, monkeypatch)
+    assert damping * np.abs(damped.v).max() < 1.0
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.1, 0.5])

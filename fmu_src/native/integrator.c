@@ -139,15 +139,16 @@ static double short_step(Step *step, double left, int hold_ends, int rank_held, 
 }
 
 /* Integrate from the time t and the state y until an event, the end, or the end of the budget; return the time, with y
-   the state there, or NaN on failure. */
-static double until_event(Step *step, double t, double end, int hold_ends, int rank_held, int *integrator,
+   the state there, or NaN on failure. A step whose product with the damping rate exceeds STABLE is one of ROS34PW2. */
+static double until_event(Step *step, double t, double end, int hold_ends, int rank_held, double *rate,
                           Event *event, Failure *failure)
 {
     const double max_step = step->plant->value[MAX_STEP];
+    const int automatic = step->plant->value[INTEGRATOR] == AUTOMATIC;
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
     if (all_rest(step))
         return end;
-    const double soon = *integrator == STIFF ? 0.0 : short_step(step, end - t, hold_ends, rank_held, event);
+    const double soon = *rate > 0.0 ? 0.0 : short_step(step, end - t, hold_ends, rank_held, event);
     if (soon > 0.0) {
         memcpy(step->y, step->y_new, sizeof step->y);
         return soon == end - t ? end : t + soon;
@@ -155,10 +156,11 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
-        const double error = *integrator == STIFF ? rosenbrock(step) : dormand_prince(step);
+        const int stiff = *rate * step->size > STABLE;
+        const double error = stiff ? rosenbrock(step) : dormand_prince(step);
         const double norm = error / share_of_tolerance(step);
-        const int order = (*integrator == STIFF ? 3 : 5) - step->crossed;
-        double factor = norm > 0.0 ? SAFETY * pow(norm, -1.0 / order) : MAX_FACTOR;
+        const int order = (stiff ? 3 : 5) - step->crossed;
+        const double factor = norm > 0.0 ? SAFETY * pow(norm, -1.0 / order) : MAX_FACTOR;
         if (norm < 1.0) {
             const double passed = first_event(step, rank_held, event);
             memcpy(step->y, step->y_new, sizeof step->y);
@@ -173,10 +175,14 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
             step->margin = step->margin_new;
             next = fmin(max_step, step->size * fmax(MIN_FACTOR, fmin(growth, factor)));
             growth = MAX_FACTOR;
-        } else if (*integrator == AUTOMATIC && damping_limits(step, fmin(max_step, end - t))) {
-            *integrator = STIFF; /* until the end of the communication step */
+            continue;
+        }
+        const double limiting = automatic && !stiff ? limiting_rate(step, fmin(max_step, end - t)) : 0.0;
+        if (limiting > 0.0) {
+            *rate = limiting; /* until the end of the communication step */
         } else {
-            next = step->size * (isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
+            const int again = stiff && growth == 1.0; /* errors of stiff modes hardly depend on the step */
+            next = step->size * (isfinite(norm) && !again ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
             if (next < 10.0 * (nextafter(end, HUGE_VAL) - end)) {
                 failure->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
@@ -195,11 +201,11 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
 {
     if (IS_CONTROLLER)
         return 1;
-    int kept[N_JOINTS], integrator = (int)plant->value[INTEGRATOR];
+    int kept[N_JOINTS];
     Event event;
     AntiChatter chatter;
     Step step;
-    double t = 0.0;
+    double t = 0.0, rate = plant->value[INTEGRATOR] == STIFF ? HUGE_VAL : 0.0;
     step.plant = plant;
     step.evaluations = *evaluations;
     step.stops.rank = N_ROWS;
@@ -217,7 +223,7 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
         step.crossed |= t > 0.0 && step.stops.rank != before;
         if (changes_back(&chatter, &step, before, t))
             continue;
-        t = until_event(&step, t, end, end < h && !rank_held, rank_held, &integrator, &event, failure);
+        t = until_event(&step, t, end, end < h && !rank_held, rank_held, &rate, &event, failure);
         find_chatter(&chatter, &step, &event, t);
         for (int i = 0; stopped_at && i < N_JOINTS; i++)
             if (event.stopped[i])

@@ -30,33 +30,47 @@ static const double CUBIC[N_INCREMENTS + 1][4] = {
    this method is cheaper. */
 static const double STABLE = 3.3, WORTH = 12.0;
 
-/* x of (M + s D) x = τ at y, with joints at rest held. */
-static void damped_motion(const Step *step, double s, const double tau[N_JOINTS], double x[N_JOINTS])
+/* The system (M + s D) x = τ at y, with joints at rest held. */
+typedef struct {
+    double held[N_JOINTS], free[N_JOINTS], inertia[N_JOINTS];
+    JointPosition joint[N_BODIES];
+    EndBody end_body[N_LOADED];
+} DampedSystem;
+
+static void damped_system(const Step *step, double s, DampedSystem *system)
 {
     const double *value = step->plant->value;
-    double inertia[N_JOINTS], free[N_JOINTS], given[N_JOINTS], reaction[N_JOINTS];
     for (int i = 0; i < N_JOINTS; i++) {
         const Rest held = step->stops.held[i];
-        free[i] = held == FREE || held == CLAMPED;
-        given[i] = held == FREE ? tau[i] : 0.0;
-        inertia[i] = value[ARMATURE + i] + (held == FREE ? s * value[DAMPING + i] : 0.0);
+        system->held[i] = held != FREE;
+        system->free[i] = held == FREE || held == CLAMPED;
+        system->inertia[i] = value[ARMATURE + i] + (held == FREE ? s * value[DAMPING + i] : 0.0);
     }
-    hybrid_motion(step->plant, step->y, inertia, free, given, x, reaction);
-    for (int i = 0; i < N_JOINTS; i++)
-        x[i] = step->stops.held[i] ? 0.0 : x[i];
+    place_joints(step->y, system->joint);
+    body(value, 0, system->end_body);
 }
 
-/* Solve (1 − h γ T) u = r in place. */
-static void solve(const Step *step, double u[N_STATES])
+/* x of the system for τ. */
+static void damped_motion(const DampedSystem *system, const double tau[N_JOINTS], double x[N_JOINTS])
 {
-    const double scale = step->size * GAMMA, *damping = &step->plant->value[DAMPING];
+    double given[N_JOINTS], reaction[N_JOINTS];
+    for (int i = 0; i < N_JOINTS; i++)
+        given[i] = system->held[i] != 0.0 ? 0.0 : tau[i];
+    hybrid_dynamics(system->joint, system->end_body, system->inertia, system->free, given, x, reaction);
+    for (int i = 0; i < N_JOINTS; i++)
+        x[i] = system->held[i] != 0.0 ? 0.0 : x[i];
+}
+
+/* Solve (1 − s T) u = r in place, with the system for s = h γ. */
+static void solve(const DampedSystem *system, double s, const double damping[N_JOINTS], double u[N_STATES])
+{
     double effort[N_JOINTS], change[N_JOINTS];
     for (int i = 0; i < N_JOINTS; i++)
-        effort[i] = scale * damping[i] * u[N_JOINTS + i];
-    damped_motion(step, scale, effort, change);
+        effort[i] = s * damping[i] * u[N_JOINTS + i];
+    damped_motion(system, effort, change);
     for (int i = 0; i < N_JOINTS; i++) {
         u[N_JOINTS + i] -= change[i];
-        u[i] += scale * u[N_JOINTS + i];
+        u[i] += s * u[N_JOINTS + i];
     }
 }
 
@@ -73,7 +87,10 @@ static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_I
 static double rosenbrock(Step *step)
 {
     const double h = step->size, rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
+    const double *damping = &step->plant->value[DAMPING];
     double u[N_INCREMENTS][N_STATES], k[N_STATES], error[N_STATES], *y_new = step->y_new;
+    DampedSystem system;
+    damped_system(step, h * GAMMA, &system);
     memcpy(k, step->K[0], sizeof k);
     memcpy(y_new, step->y, sizeof k);
     for (int stage = 0; stage <= N_INCREMENTS; stage++) {
@@ -88,13 +105,14 @@ static double rosenbrock(Step *step)
         if (stage < N_INCREMENTS) {
             for (int i = 0; i < N_STATES; i++)
                 u[stage][i] = GAMMA * (h * k[i] + weighted(u, COUPLING[stage], stage, i));
-            solve(step, u[stage]);
+            solve(&system, h * GAMMA, damping, u[stage]);
         }
     }
     for (int i = 0; i < N_STATES; i++) {
         error[i] = weighted(u, ESTIMATE, N_INCREMENTS, i);
         step->K[2][i] = (weighted(u, WEIGHT[N_INCREMENTS - 1], N_INCREMENTS - 1, i) + u[N_INCREMENTS - 1][i]) / h;
     }
+    solve(&system, h * GAMMA, damping, error); /* it damps stiff modes as the method does */
     for (int i = 0; i < N_JOINTS; i++) {
         const double v = step->y[N_JOINTS + i], v_new = y_new[N_JOINTS + i], mean = step->K[2][i];
         const double first = (6.0 * mean - 4.0 * v - 2.0 * v_new) / h;
@@ -112,20 +130,22 @@ static double rosenbrock(Step *step)
     return error_norm(step, error);
 }
 
-/* True if a step of Dormand–Prince failed because of stiff damping, and this method is cheaper at the largest step, s.
-   */
-static int damping_limits(const Step *step, double largest)
+/* The rate of damping, 1/s, if a step of Dormand–Prince failed because of it, and this method is cheaper at the largest
+   step, s; else 0. */
+static double limiting_rate(const Step *step, double largest)
 {
     double effort[N_JOINTS], answer[N_JOINTS], power = 0.0, rate = 0.0;
+    DampedSystem system;
     for (int i = 0; i < N_JOINTS; i++) {
         const double change = step->K[STAGES][i] - step->K[STAGES - 1][i];
         effort[i] = step->plant->value[DAMPING + i] * change;
         power += effort[i] * change;
     }
     if (!(power > 0.0))
-        return 0;
-    damped_motion(step, 0.0, effort, answer);
+        return 0.0;
+    damped_system(step, 0.0, &system);
+    damped_motion(&system, effort, answer);
     for (int i = 0; i < N_JOINTS; i++)
         rate += effort[i] * answer[i] / power; /* a Rayleigh quotient of M⁻¹D: the fastest mode dominates */
-    return rate * step->size > STABLE && rate * largest > WORTH;
+    return rate * step->size > STABLE && rate * largest > WORTH ? rate : 0.0;
 }

@@ -24,7 +24,7 @@ from . import event_search as events
 from .dormand_prince import HEUN, Array, P, State, dormand_prince, error_norm, heun, interpolant, shared_tolerance
 from .equations import Equations
 from .pseudo_inverse import rank_margin
-from .rosenbrock import CUBIC, damping_limits, rosenbrock
+from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock
 from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
@@ -90,7 +90,7 @@ class Motion:
         self.coarseness = min(1.0, rtol / events.USUAL_RTOL)
         self._damping = np.array(equations.damping) if len(equations.damping) else np.zeros(n)
         self._automatic = integrator == AUTOMATIC and bool(len(equations.damping))
-        self._stiff = integrator == STIFF
+        self._rate = inf if integrator == STIFF else 0.0  # of damping; longer steps than STABLE / rate are stiff
         self.rank = MOST_ROWS
         self.rank_held = self.crossed = False
         self.grips: list[list[float]] = []
@@ -150,7 +150,7 @@ class Motion:
         """
         if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
             return end, y, events.Event()  # inputs and all joints are held: nothing changes
-        soon = None if self._stiff else self._short_step(y, rates, end - t, hold_ends)
+        soon = None if self._rate else self._short_step(y, rates, end - t, hold_ends)
         if soon is not None:
             passed, y, event = soon
             return end if passed == end - t else t + passed, y, event
@@ -160,7 +160,8 @@ class Motion:
             if last:
                 step = end - t
             del self.grips[1:], self.margins[1:]
-            if self._stiff:
+            stiff = self._rate * step > STABLE
+            if stiff:
                 mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
                 y_new, K, norm = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances)
             else:
@@ -169,10 +170,10 @@ class Motion:
             norm /= self._share(step)
             factor = MIN_FACTOR
             if isfinite(norm):
-                order = (3 if self._stiff else 5) - self.crossed
+                order = (3 if stiff else 5) - self.crossed
                 factor = SAFETY * norm ** (-1 / order) if norm > 0.0 else MAX_FACTOR
             if norm < 1.0:
-                found = self._first_event(y, y_new, step, K, CUBIC if self._stiff else P)
+                found = self._first_event(y, y_new, step, K, CUBIC if stiff else P)
                 if found is not None:
                     passed, y, event = found
                     return end if last and passed == step else t + passed, y, event
@@ -182,12 +183,11 @@ class Motion:
                 self.grips[0], self.margins[0] = self.grips[-1], self.margins[-1]
                 step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
                 growth = MAX_FACTOR
-            elif self._automatic and damping_limits(
-                self.stops.mobility(y[: self.n]), self._damping, K, step, min(self.max_step, end - t)
-            ):
-                self._stiff, self._automatic = True, False  # until the end of the communication step
+            elif self._automatic and not stiff and (rate := self._limiting_rate(y, K, step, end - t)):
+                self._rate = rate  # until the end of the communication step
             else:
-                step *= max(MIN_FACTOR, factor)
+                again = stiff and growth == 1.0  # errors of stiff modes hardly depend on the step
+                step *= MIN_FACTOR if again else max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
                 if step < 10 * ulp(end):
                     if not all(map(isfinite, chain(*K))):
@@ -197,6 +197,10 @@ class Motion:
                         )
                     raise self._too_fast(y, too_fine=True)
         return t, y, events.Event()
+
+    def _limiting_rate(self, y: State, K: list[State], step: float, left: float) -> float:
+        mobility = self.stops.mobility(y[: self.n])
+        return limiting_rate(mobility, self._damping, K, step, min(self.max_step, left))
 
     def check_budget(self, y: State) -> None:
         """Raise StepError at y if no evaluations are left."""
