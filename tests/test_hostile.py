@@ -185,6 +185,7 @@ def arrays(*dimensions: str, step: str = "0.01", aliases: int = 0, name: str = "
 
 
 TOO_MANY = "more than 50000 elements"
+LONG_NAMES = "names of its arrays' elements have more than 8388608 characters"
 ARRAYS = {
     "a billion": (arrays('start="1000000000"'), TOO_MANY),
     "2^64 - 1": (arrays('start="18446744073709551615"'), "a dimension of no known size"),
@@ -197,6 +198,7 @@ ARRAYS = {
     "40,000 names": (arrays('start="40000"', aliases=40_000), TOO_MANY),
     "300,000 names of a scalar": (arrays(aliases=300_000), TOO_MANY),
     "a name of 100,000 characters": (arrays('start="49000"', name="A" * 100_000), "has more than 1000 characters"),
+    "49,000 names of 1000 characters": (arrays('start="49000"', name="A" * 1000), LONG_NAMES),
     "100,000 variables without a name": (arrays(more="<Float64/>" * 100_000), "'name' is required"),
     "as many as there may be": (arrays('start="49998"'), "names|to log|cannot be loaded"),
     "a step of 1e-300 s": (arrays('start="2"', step="1e-300"), "at least 1e-06 s"),

@@ -25,6 +25,7 @@ from sinks import Collector
 
 import twodof
 from twodof.bag.provenance import MAX_TAIL
+from twodof.errors import TwoDofError
 from twodof.pages.loop import Loop
 from twodof.plots.track import read_tracks
 
@@ -373,6 +374,16 @@ def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run, tmp_p
         if not equal:
             damaged.append(n)
     assert damaged == []
+
+
+def test_a_provenance_that_no_reader_accepts_is_not_written(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", MAX_TAIL + 1000)
+    with (
+        pytest.raises(TwoDofError, match=r"names and start values of .* at most 0 are stored"),
+        twodof.Bag(tmp_path / "b").begin(run),
+    ):
+        pass
+    assert not [*tmp_path.iterdir()]
 
 
 def test_provenance_is_there_before_the_first_message(run, tmp_path):

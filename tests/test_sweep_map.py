@@ -3,12 +3,14 @@
 import io
 import json
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
 import browser
 import numpy as np
 import pytest
+from bags import HEADER, channel, chunk, message, record, texts
 from figures import points
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
@@ -16,7 +18,10 @@ from PIL import Image
 from tables import SMALL, table_of
 
 from twodof import read_bag, sweep
+from twodof.bag.mcap import zstd
 from twodof.bag.recording import Recording
+from twodof.bag.records import ReadBudget
+from twodof.bounds import MAX_CHUNK
 from twodof.cli.main import main
 from twodof.plots import maps
 from twodof.plots.figure import drawn, save
@@ -182,6 +187,26 @@ def test_a_page_judges_no_run(native_path, tmp_path, monkeypatch):
     curves = maps._curves(read_sweep(folder), folder / "bags")
     assert [bool(curves[run]["verdict"]) for run in ("0", "1")] == [True, False]
     assert curves["1"]["lines"]
+
+
+def test_the_bags_of_a_page_share_a_read_budget(native_path, tmp_path, monkeypatch):
+    """Each of 2000 bags of 500 bytes could unpack to 64 MB of records."""
+    folder, spent = tmp_path / "s", []
+    sweep(native_path, grid={"Kp": [10, 20, 30, 40]}, stop_time=0.02, output=folder, bags=True)
+    schema = record(3, struct.pack("<H", 1), texts("std_msgs/msg/String", "ros2msg", ""))
+    records = schema + (channel(1, "/x") + message(b"")) * 100_000
+    packed = zstd.compress(records)
+    for bag in (folder / "bags").iterdir():
+        (bag / f"{bag.name}.mcap").write_bytes(HEADER + chunk(packed, len(records), "zstd"))
+    spend = ReadBudget.spend
+
+    def counted(budget: ReadBudget, size: int) -> None:
+        spent.append(size)
+        spend(budget, size)
+
+    monkeypatch.setattr(ReadBudget, "spend", counted)
+    assert maps._curves(read_sweep(folder), folder / "bags") == {}
+    assert sum(spent) < 1.5 * MAX_CHUNK
 
 
 def test_a_click_in_the_map_opens_the_runs_curves(native_path, tmp_path):

@@ -13,6 +13,7 @@ MAX_FOLDERS_DEEP = 50  # nested folders
 # FMUs
 MAX_DESCRIPTION = 8 * MIB  # some 50,000 variables; of a system: structure, parameter sets and mappings together
 MAX_ELEMENTS = 50_000  # elements of all arrays of FMI 3.0, including aliases
+MAX_NAMES = 8 * MIB  # names of these elements together
 MAX_NAME = 1000  # characters of a name, and of a text that variables share
 MAX_DISPLAY_UNITS = 100  # of a unit
 MAX_DIMENSIONS = 16  # dimensions of an array of FMI 3.0; a matrix has 2

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
-from ..bounds import CHANGE, MAX_HELD, MAX_NAME, MAX_PROVENANCE, MAX_ROBOTS, MAX_VARIABLES
+from ..bounds import CHANGE, MAX_HELD, MAX_NAME, MAX_PROVENANCE, MAX_ROBOTS, MAX_VARIABLES, MIB
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..fmu import System
@@ -92,6 +92,10 @@ class ProvenanceFile:
     def __init__(self, folder: Path, namespace: str, run: Experiment, command_line: str) -> None:
         self.path, self.key = folder / file_of(namespace), key_of(namespace)
         self._head = _as_json(provenance_of(run, command_line))[:-1] + b',"input_changes":['
+        if len(self._head) > MAX_PROVENANCE - MAX_TAIL:
+            much = f"names and start values of '{run.fmu.path}' have {len(self._head) // MIB} MiB"
+            most = (MAX_PROVENANCE - MAX_TAIL) // MIB
+            raise BagError(f"cannot write '{self.path}': {much}; at most {most} are stored")
         self._run, self._commanders = run, len(run.commanders)
         self._verdict: dict[str, object] | None = None
         self._until: float | None = None

@@ -53,9 +53,9 @@ def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], S
     return _read([_Robot(Path(path), JointStates, Targets(), Downsampler(most, lines))])[0]
 
 
-def read_bags(paths: Sequence[str | Path]) -> list[Recording]:
-    """Read robots of one bag as ``read_bag`` does, in one pass."""
-    return _read([_Robot(Path(path), JointStates, Targets()) for path in paths])
+def read_bags(paths: Sequence[str | Path], budget: ReadBudget | None = None) -> list[Recording]:
+    """Read robots of one bag as ``read_bag`` does, in one pass; the budget may be that of several bags together."""
+    return _read([_Robot(Path(path), JointStates, Targets()) for path in paths], budget)
 
 
 def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
@@ -179,11 +179,11 @@ class _Robot:
         return self._made()
 
 
-def _read(robots: Sequence[_Robot]) -> list[Recording]:
+def _read(robots: Sequence[_Robot], budget: ReadBudget | None = None) -> list[Recording]:
     """Read a bag once, for some of its robots."""
     if not robots:
         return []
-    budget, total, most, folder = ReadBudget(), 0, MAX_SAMPLES, robots[0].folder
+    budget, total, most, folder = budget or ReadBudget(), 0, MAX_SAMPLES, robots[0].folder
     with _refusing(folder):
         files = whole_bag(folder)
         if robots[0].downsampler is None:  # a bag of a few MB may unpack to gigabytes

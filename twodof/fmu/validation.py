@@ -13,7 +13,7 @@ import fmpy
 import lxml.etree
 from fmpy.model_description import ModelDescription
 
-from ..bounds import MAX_DIMENSIONS, MAX_DISPLAY_UNITS, MAX_ELEMENTS, MAX_NAME
+from ..bounds import MAX_DIMENSIONS, MAX_DISPLAY_UNITS, MAX_ELEMENTS, MAX_NAME, MAX_NAMES
 
 SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3": "fmi3/fmi3ModelDescription"}
 """Schema files in FMPy, by the major version of FMI."""
@@ -137,7 +137,7 @@ def _shared_texts(each: ET.Element) -> Iterator[tuple[str, str]]:
 def _check_arrays(root: ET.Element) -> None:
     """Raise ValueError for invalid sizes and too many elements, including aliases."""
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
-    room = MAX_ELEMENTS
+    room, letters = MAX_ELEMENTS, MAX_NAMES
     for variable in root.iterfind("ModelVariables/*"):
         names = [each.get("name", "") for each in (variable, *variable.iterfind("Alias"))]
         name, dimensions = names[0], variable.findall("Dimension")
@@ -146,6 +146,11 @@ def _check_arrays(root: ET.Element) -> None:
             raise ValueError(f"variable '{name}' has more than {MAX_DIMENSIONS} dimensions")
         if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
             raise ValueError(f"variable '{name}' has a dimension of no known size")
-        room -= math.prod(max(1, int(text)) for text in texts) * len(names) if dimensions else len(names) - 1
+        elements = math.prod(max(1, int(text)) for text in texts)
+        room -= elements * len(names) if dimensions else len(names) - 1
+        letters -= elements * sum(map(len, names)) if dimensions else 0
         if room < 0:
             raise ValueError(f"with variable '{name}' its arrays have more than {MAX_ELEMENTS} elements")
+        if letters < 0:
+            much = f"the names of its arrays' elements have more than {MAX_NAMES} characters"
+            raise ValueError(f"with variable '{name:.40}' {much}")

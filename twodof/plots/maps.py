@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bag.reader import read_bag
+from ..bag.reader import read_bags
+from ..bag.records import ReadBudget
 from ..errors import BagError
 from ..sweeps.ranking import METRICS, beyond_limits
 from .interactive import figures_html
@@ -70,12 +71,12 @@ def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, ob
     curves: dict[str, dict[str, object]] = {}
     if bags is None or not bags.is_dir():
         return curves
-    room = MOST_NUMBERS
+    room, budget = MOST_NUMBERS, ReadBudget()
     for run in rows["run"].tolist()[:MOST_CURVES]:
         if room < 0:  # the other runs have no curves
             break
         try:
-            bag = read_bag(bags / f"{run:06d}")
+            (bag,) = read_bags([bags / f"{run:06d}"], budget)
             lines = {name: bag.q[:, i] for i, name in enumerate(bag.joints)}
             if bag.x.size and bag.x.shape == bag.target.shape:
                 lines = {"distance from the target, m": np.linalg.norm(bag.x - bag.target, axis=1), **lines}
