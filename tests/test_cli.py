@@ -359,6 +359,12 @@ def test_compilation_shows_progress(tmp_path):
     assert shown.stdout.endswith("\x1b[K")
 
 
+def test_each_help_begins_with_a_sentence_about_its_command():
+    program, verbs = parser()
+    for verb in (program, *(verb for name, verb in verbs.items() if name != "help")):
+        assert re.match(r"[A-Z].*\.$", verb.description or "", re.DOTALL), verb.prog
+
+
 def test_help_texts_are_phrases_that_stand_alone():
     """A default or a unit alone explains no option."""
     for verb, its_parser in parser()[1].items():

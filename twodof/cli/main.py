@@ -39,7 +39,8 @@ def parser() -> tuple[Parser, dict[str, Parser]]:
     verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb in VERBS:
         text = str(verb.__doc__).partition(": ")[2].rstrip(".\n")
-        added = verbs.add_parser(verb.__name__.rpartition(".")[2], help=text)
+        name = verb.__name__.rpartition(".")[2]
+        added = verbs.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         added.set_defaults(call=verb.call)
         verb.add(added)
     helped = verbs.add_parser("help", help="show this help, or the options of a command")
