@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from sinks import Collector
 
 import twodof
 from twodof.bag.provenance import MAX_TAIL
+from twodof.bounds import MIB
 from twodof.errors import TwoDofError
 from twodof.pages.loop import Loop
 from twodof.plots.track import read_tracks
@@ -379,11 +381,20 @@ def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run, tmp_p
 def test_a_provenance_that_no_reader_accepts_is_not_written(run, tmp_path, monkeypatch):
     monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", MAX_TAIL + 1000)
     with (
-        pytest.raises(TwoDofError, match=r"names and start values of .* at most 0 are stored"),
+        pytest.raises(TwoDofError, match=r"robot description, names and start values of .* at most 0 are stored"),
         twodof.Bag(tmp_path / "b").begin(run),
     ):
         pass
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_large_robot_description_is_stored_as_it_is(run, tmp_path):
+    """JSON may not make 36 MB of 6 MB of spaces, which no reader would accept."""
+    wide = run.fmu.urdf.replace("</robot>", f"<!--{' ' * (6 * MIB)}--></robot>")
+    with patch.object(type(run.fmu), "urdf", wide), twodof.Bag(tmp_path / "b").begin(run) as bag:
+        bag.write(sample(run, 0))
+    assert (tmp_path / "b/run.json").stat().st_size < 7 * MIB
+    assert twodof.read_bag(tmp_path / "b").provenance["urdf"] == wide
 
 
 def test_provenance_is_there_before_the_first_message(run, tmp_path):

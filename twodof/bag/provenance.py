@@ -93,7 +93,9 @@ class ProvenanceFile:
         self.path, self.key = folder / file_of(namespace), key_of(namespace)
         self._head = _as_json(provenance_of(run, command_line))[:-1] + b',"input_changes":['
         if len(self._head) > MAX_PROVENANCE - MAX_TAIL:
-            much = f"names and start values of '{run.fmu.path}' have {len(self._head) // MIB} MiB"
+            much = (
+                f"the robot description, names and start values of '{run.fmu.path}' have {len(self._head) // MIB} MiB"
+            )
             most = (MAX_PROVENANCE - MAX_TAIL) // MIB
             raise BagError(f"cannot write '{self.path}': {much}; at most {most} are stored")
         self._run, self._commanders = run, len(run.commanders)
@@ -127,7 +129,7 @@ class ProvenanceFile:
         content = self.path.read_bytes()
         if len(content) > len(self._head) + MAX_YAML:
             content = self._head + self._tail(self._start)
-        return content.decode().strip()
+        return _for_yaml(content)
 
     def _tail(self, until: float | None = None) -> bytes:
         """Return the commanders, the verdict, and the time until which the changes of inputs are complete."""
@@ -145,7 +147,7 @@ def for_metadata(text: bytes, provenance: Provenance) -> str:
     """Return the text of a run.json for metadata.yaml, without the changes of inputs if it is long."""
     if len(text) > MAX_YAML:
         text = _as_json({**provenance, "input_changes": [], KNOWN_UNTIL: provenance["start_time"]})
-    return text.decode("utf-8").strip()
+    return _for_yaml(text)
 
 
 def provenance_of(run: Experiment, command_line: str) -> Provenance:
@@ -226,8 +228,12 @@ def each_robot(path: Path) -> list[Path]:
 
 
 def _as_json(content: object) -> bytes:
+    return json.dumps(content, separators=(",", ":")).encode()
+
+
+def _for_yaml(text: bytes) -> str:
     """Return JSON without spaces, because some YAML writers fold lines incorrectly at spaces."""
-    return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
+    return text.decode("utf-8").strip().replace(" ", "\\u0020")
 
 
 def read_provenance(path: Path, namespace: str = "") -> Provenance:
