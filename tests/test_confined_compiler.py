@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from twodof.errors import BuildError
+from twodof.export import compiler
 from twodof.export.compiler import compile_web_module
 
 pytestmark = pytest.mark.needs("linux")
@@ -43,6 +44,21 @@ def test_no_other_file_is_read(tmp_path: Path, attack: object) -> None:
     assert callable(attack)
     with pytest.raises(BuildError, match="the compiler failed"):
         compile_web_module({"page.c": attack(secret).encode()}, ["page.c"])
+
+
+def test_the_cache_of_other_builds_is_not_written(tmp_path: Path) -> None:
+    """Untrusted sources could otherwise leave a library there, which a later build would take."""
+    cache, source = tmp_path / "cache", tmp_path / "sources/a.c"
+    for folder in (cache, source.parent):
+        folder.mkdir()
+    source.write_text("int a;\n")
+    environment = {**os.environ, "ZIG_GLOBAL_CACHE_DIR": str(cache), "ZIG_LOCAL_CACHE_DIR": str(source.parent)}
+    command = [*compiler.ZIG, "wasm32-freestanding", "-c", str(source), "-o"]
+    compiler._run_confined([*command, str(source.parent / "a.o")], source.parent, environment)
+    assert (source.parent / "a.o").exists()
+    with pytest.raises(BuildError, match="the compiler failed"):
+        compiler._run_confined([*command, str(cache / "planted.o")], source.parent, environment)
+    assert not (cache / "planted.o").exists()
 
 
 def test_a_module_is_not_larger_than_a_page_holds() -> None:

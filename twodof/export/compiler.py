@@ -262,12 +262,19 @@ def _check_status(command: Sequence[str], status: int, text: str) -> None:
 
 
 def _run_confined(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
-    """Run zig in a process that reads only zig and the sources, and writes only its output and its caches."""
+    """Run zig in a process that reads only zig and the sources, and writes only its output and a cache of its own.
+
+    A program that untrusted sources control cannot write into the cache of other builds.
+    """
+    cache = Path(environment["ZIG_GLOBAL_CACHE_DIR"]) / "untrusted"
+    with suppress(OSError):  # without it the compiler fails, and says why
+        cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+    environment = {**environment, "ZIG_GLOBAL_CACHE_DIR": str(cache)}
     ziglang = importlib.util.find_spec("ziglang")
     assert ziglang is not None and ziglang.origin is not None
     home = Path(ziglang.origin).parent
     command = [str(home / ("zig.exe" if sys.platform == "win32" else "zig")), *command[ZIG.index("cc") :]]
-    folders = [folder, Path(environment["ZIG_GLOBAL_CACHE_DIR"])]
+    folders = [folder, cache]
     with Child(_compile_in_child, command, home, folders, environment=environment) as child:
         try:
             status, text = json.loads(child.receive(MAX_COMPILER_TEXT, MAX_COMPILER_WAIT))
