@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from friction_oracle import Rubbing
 from harness import Driver, in_child_process
 from native_models import Engine, engine, from_urdf, shipped
 from scipy.integrate import solve_ivp
@@ -156,6 +157,21 @@ def test_stops_and_friction_are_those_of_the_other_integrator(pendulum, rigid, f
     assert np.abs(ends[0] - ends[1]).max() <= 1e-6
 
 
+@pytest.mark.parametrize("max_step", [1e-3, 5e-3])
+@pytest.mark.parametrize("stop", [1.0, 0.2801], ids=["friction", "stop"])
+def test_a_stiff_joint_comes_to_rest_where_its_motion_ends(stop, max_step, pendulum):
+    """Its velocity decays within microseconds, so it moves by 5e-7 rad. An integration step of max_step is too long."""
+    efforts, changes = [0.6, -0.006], {"damping": [0.0, 6.0], "friction": [0.0, 2.5e-4], "q_max": [2.0, stop]}
+    changes |= {"q_start": [-0.07, 0.28], "v_start": [0.2, 0.5], "gravity": [0.0, 0.0, -9.81], "tau_cmd": efforts}
+    found = both(pendulum, started(pendulum, AUTOMATIC, **changes, max_step=max_step), 1)
+    model = pendulum.model.robot.model.copy()
+    model.gravity.linear = np.array(changes["gravity"])
+    given = (changes["friction"], changes["damping"], [0.0, 0.0], [-2.0, -1.0], changes["q_max"])
+    oracle = Rubbing(model, lambda *_: np.array(efforts), *map(np.array, given))
+    exact = oracle.run(changes["q_start"], changes["v_start"], [STEP])[0][-1]
+    assert np.abs(found[:2] - exact[:2]).max() <= 1e-5
+
+
 def test_a_stiff_joint_rests_on_its_stop_and_leaves_it(pendulum):
     """Dormand–Prince agrees with many more steps; M⁻¹D is 1e5 1/s."""
     changes = {"damping": [0.1, 0.5], "q_max": [2.0, 0.01], "q_start": [0.0, 0.0], "friction": [0.01, 0.02], **TIGHT}
@@ -210,7 +226,7 @@ def test_dense_output_is_of_third_order_and_velocities_begin_with_the_accelerati
     y, worst = [0.7, 0.0], []
     exact = solve_ivp(lambda t, y: rates(y), (0, 0.1), y, "DOP853", rtol=1e-12, atol=1e-14, dense_output=True).sol
     for h in (0.04, 0.02):
-        y_new, K, _ = rosenbrock.rosenbrock(rates, np.eye(1), np.array([3.0]), y, h, rates(y), 1e-3, 1e-6)
+        y_new, K, *_ = rosenbrock.rosenbrock(rates, np.eye(1), np.array([3.0]), y, h, rates(y), 1e-3, 1e-6)
         state = interpolant(y, y_new, K, rosenbrock.CUBIC, h)
         worst.append(np.max([np.abs(np.subtract(state(t), exact(t))) for t in np.linspace(0.0, h, 9)], axis=0))
         assert (state(1e-9 * h)[1] - y[1]) / (1e-9 * h) == pytest.approx(rates(y)[1], rel=1e-6)

@@ -20,6 +20,7 @@ typedef struct {
     double rounding;                       /* bound on the rounding error of the holding efforts */
     long evaluations;                      /* evaluations of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */
+    double inside;                         /* norm of its error, if it exceeds that of y_new; else 0 */
     double margin, margin_new;             /* margins of the rank at y and y_new */
     int crossed;                           /* whether the rank has changed in the communication step */
     Stops stops;
@@ -101,6 +102,7 @@ static double dormand_prince(Step *step)
         error[i] *= step->size;
     }
     step->stages = STAGES;
+    step->inside = 0.0;
     step->P = P;
     return error_norm(step, error);
 }

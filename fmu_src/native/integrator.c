@@ -158,11 +158,12 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
         step->size = last ? end - t : next;
         const int stiff = *rate * step->size > STABLE;
         const double error = stiff ? rosenbrock(step) : dormand_prince(step);
-        const double norm = error / share_of_tolerance(step);
+        const double share = share_of_tolerance(step);
+        const double passed = error < share ? first_event(step, rank_held, event) : 0.0;
+        const double norm = (passed > 0.0 ? fmax(error, step->inside) : error) / share;
         const int order = (stiff ? 3 : 5) - step->crossed;
         const double factor = norm > 0.0 ? SAFETY * pow(norm, -1.0 / order) : MAX_FACTOR;
         if (norm < 1.0) {
-            const double passed = first_event(step, rank_held, event);
             memcpy(step->y, step->y_new, sizeof step->y);
             if (last && (passed == 0.0 || passed == step->size))
                 return end;
@@ -177,6 +178,7 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
             growth = MAX_FACTOR;
             continue;
         }
+        memset(event, 0, sizeof *event);
         const double limiting = automatic && !stiff ? limiting_rate(step, fmin(max_step, end - t)) : 0.0;
         if (limiting > 0.0) {
             *rate = limiting; /* until the end of the communication step */

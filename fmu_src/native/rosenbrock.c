@@ -112,7 +112,6 @@ static double rosenbrock(Step *step)
         error[i] = weighted(u, ESTIMATE, N_INCREMENTS, i);
         step->K[2][i] = (weighted(u, WEIGHT[N_INCREMENTS - 1], N_INCREMENTS - 1, i) + u[N_INCREMENTS - 1][i]) / h;
     }
-    solve(&system, h * GAMMA, damping, error); /* it damps stiff modes as the method does */
     for (int i = 0; i < N_JOINTS; i++) {
         const double v = step->y[N_JOINTS + i], v_new = y_new[N_JOINTS + i], mean = step->K[2][i];
         const double first = (6.0 * mean - 4.0 * v - 2.0 * v_new) / h;
@@ -127,6 +126,8 @@ static double rosenbrock(Step *step)
     step->stages = N_INCREMENTS;
     step->P = CUBIC;
     memcpy(step->K[N_INCREMENTS], k, sizeof k);
+    step->inside = error_norm(step, error);
+    solve(&system, h * GAMMA, damping, error); /* it damps stiff modes as the method does */
     return error_norm(step, error);
 }
 

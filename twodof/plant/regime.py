@@ -163,17 +163,18 @@ class Motion:
             stiff = self._rate * step > STABLE
             if stiff:
                 mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
-                y_new, K, norm = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances)
+                y_new, K, norm, inside = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances)
             else:
                 y_new, K = dormand_prince(self.rates, y, step, rates)
-                norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
-            norm /= self._share(step)
+                norm, inside = error_norm(K, y, y_new, step, self.rtol, self.atol), 0.0
+            share = self._share(step)
+            found = self._first_event(y, y_new, step, K, CUBIC if stiff else P) if norm < share else None
+            norm = (norm if found is None else max(norm, inside)) / share
             factor = MIN_FACTOR
             if isfinite(norm):
                 order = (3 if stiff else 5) - self.crossed
                 factor = SAFETY * norm ** (-1 / order) if norm > 0.0 else MAX_FACTOR
             if norm < 1.0:
-                found = self._first_event(y, y_new, step, K, CUBIC if stiff else P)
                 if found is not None:
                     passed, y, event = found
                     return end if last and passed == step else t + passed, y, event
