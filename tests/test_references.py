@@ -338,6 +338,16 @@ def test_an_output_in_the_place_of_another_fails(control: str, tmp_path: Path) -
         assert own or {*pair} in (SYMMETRIC, LEVER), pair
 
 
+@pytest.mark.parametrize("damping", [2.0, 50.0])
+def test_a_stiff_joint_meets_its_references_at_the_usual_tolerance(damping: float, tmp_path: Path) -> None:
+    """In its acceleration, damping / inertia multiplies an error of its velocity, here by 1e4 or more per second."""
+    options = twodof.FmuOptions(native=True, reference=True, settings={"damping": (0.0, damping)})
+    path = twodof.build_fmu(tmp_path / "arm.fmu", options)
+    assert {name: row.outcome for name, row in rows(path).items()} == ALL_PASSED, rows(path)
+    tolerances = {reference.name: reference.tolerance for reference in references_of(load_any_fmu(path))}
+    assert tolerances == {**dict.fromkeys(("move", "push", "sample"), 1e-10), "rest": 1e-8}
+
+
 @pytest.mark.parametrize("control", ["task", "joint", "effort"])
 def test_each_input_acts_on_results(control: str, tmp_path: Path) -> None:
     """0 in its place fails. Only a force across the plane of the arm, and damping of no redundant joint, do nothing."""
