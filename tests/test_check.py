@@ -273,6 +273,14 @@ def test_derivatives_are_compared_inside_a_limit_that_a_parameter_states(limit: 
     assert row.outcome == "passed" and ("at a jump" in row.text) == (limit > 0.5), str(check)
 
 
+def test_derivatives_over_a_state_that_cannot_change_are_not_compared(tmp_path: Path) -> None:
+    """Stock robots have joints whose limits are equal."""
+    settings = {"q_min": (0.5, -3.0), "q_max": (0.5, 3.0)}
+    options = twodof.FmuOptions(native=True, control="effort", settings=settings)
+    row = {row.name: row for row in twodof.check(twodof.build_fmu(tmp_path / "arm.fmu", options)).rows}["derivatives"]
+    assert row.outcome == "passed" and "agree" in row.text, row
+
+
 def test_a_crash_at_a_forbidden_call_is_a_remark(tmp_path: Path) -> None:
     row = twodof.check(foreign(tmp_path, "FRAGILE")).rows[-2]
     text = "it ended its process at: a forbidden call, a read of a variable that does not exist: Aborted"

@@ -68,13 +68,19 @@ class Point:
         self.unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
 
     def keep_inside(self, instance: Instance) -> None:
-        """Move states that the FMU clamps, because a parameter bounds them, below their start values."""
+        """Move states that a parameter bounds below their start values, and leave out those that cannot change."""
+        for name in self._clamped(instance, 1.0):
+            self.values[name] -= 4.0 * self._widths[name]
+        for name in self._clamped(instance, -1.0):
+            del self.values[name]
+
+    def _clamped(self, instance: Instance, sign: float) -> list[str]:
+        """Return the states that the FMU clamps if they change in the direction of a sign."""
         states = [name for name in self.values if name not in self._trial.inputs]
-        far = {name: self.values[name] + self._widths[name] for name in states}
+        far = {name: self.values[name] + sign * self._widths[name] for name in states}
         self._trial.begin_again(instance, {**self.values, **far})
-        for name, value in zip(states, instance.reader(states)()):
-            if abs(value - far[name]) > 0.5 * self._widths[name]:
-                self.values[name] -= 4.0 * self._widths[name]
+        found = zip(states, instance.reader(states)())
+        return [name for name, value in found if abs(value - far[name]) > 0.5 * self._widths[name]]
 
     def slopes(self, instance: Instance, name: str, change: Callable[[Mapping[str, float]], object]) -> Slopes:
         """Return the slopes over a variable, which is changed by a function."""
