@@ -234,7 +234,7 @@ def _clock(root: ET.Element, table: Sequence[Variable], reference: int) -> None:
     attributes = {
         "name": "control_clock",
         "valueReference": str(reference),
-        "description": "ticks at each sample of the controller, first at the start time",
+        "description": "ticks at each sampling time of the controller, from the start time on",
         "causality": "input",
         "variability": "discrete",
         "intervalVariability": "fixed",

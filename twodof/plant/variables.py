@@ -56,10 +56,10 @@ class Variable:
             "parameter" (all parameters are fixed).
         unit: FMI unit name, or "".
         start: start value; None for computed variables.
-        called: name of the vector in the FMU, where it is not the group's; "" else.
-        shown: whether the FMU has it; a part of the plant's engine otherwise.
+        called: name of the vector in the FMU if it differs from the group; else "".
+        shown: whether the FMU declares it; otherwise only the engine uses it.
         columns: number of columns of a matrix, whose elements ``index`` counts row by row; 0 for other variables.
-        known: of a value of a link, the URDF's, which the controller's model has; None for other variables.
+        known: the URDF's value of a link's mass, centre or inertia, for the controller's model; else None.
     """
 
     group: str
@@ -84,7 +84,7 @@ class Variable:
 
     @property
     def is_free(self) -> bool:
-        """True for an input that is else a parameter or a constant."""
+        """True for an input that would be a parameter or a constant if it were not free."""
         return self.causality == "input" and self.group in (*FREE, *OF_LINKS)
 
     @property
@@ -151,12 +151,12 @@ CONTROLS = {
 """
 
 ON_REQUEST = ("M", "h", "J", "drift")
-"""Groups of outputs that an FMU has on request only."""
+"""Groups of outputs that only ``FmuOptions.outputs`` adds."""
 DISTURBANCES = ("tau_ext", "f_ext")
 FREE = ("gravity", "payload", "payload_com", "friction", "damping", "armature")
 """Groups of parameters that may be inputs, which can change during a run and have derivatives."""
 OF_LINKS = ("mass", "com", "inertia")
-"""Groups of values of links that may be inputs; else they are constants."""
+"""Groups of values of links, which are constants unless they are inputs."""
 OF_THE_PLANT = {
     *DISTURBANCES,
     *("x", "xd", "quat", "omega", "q_start", "v_start", "q_min", "q_max", "rtol", "atol", "max_step"),
@@ -179,50 +179,50 @@ ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ..
     ("Kd", "input", "controlled", "1/s", 40.0, "derivative gain"),
     ("Kp_rot", "input", "turn", "1/s2", 50.0, "proportional gain of the orientation"),
     ("Kd_rot", "input", "turn", "1/s", 40.0, "derivative gain of the orientation"),
-    ("tau_cmd", "input", "joint", "N|N.m", 0.0, "effort of the controller"),
-    ("tau_ext", "input", "joint", "N|N.m", 0.0, "external effort"),
+    ("tau_cmd", "input", "joint", "N|N.m", 0.0, "commanded torque or force"),
+    ("tau_ext", "input", "joint", "N|N.m", 0.0, "external torque or force"),
     ("f_ext", "input", "root", "N", 0.0, "external force at {frame}"),
-    ("Kn", "input", "", "1/s", None, "damping of the motion that does not move the end effector"),
+    ("Kn", "input", "", "1/s", None, "damping of the null-space motion, which does not move {frame}"),
     ("q", "output", "joint", "m|rad", None, "position"),
     ("v", "output", "joint", "m/s|rad/s", None, "velocity"),
     ("x", "output", "axis", "m", None, "position"),
     ("xd", "output", "axis", "m/s", None, "velocity"),
     ("quat", "output", "quaternion", "", None, "orientation of {frame}"),
     ("omega", "output", "turn", "rad/s", None, "angular velocity of {frame}"),
-    ("M", "output", "joint pair", "", None, "mass matrix with payload and armature, kg.m2, of prismatic joints kg"),
-    ("h", "output", "joint", "N|N.m", None, "effort of gravity, Coriolis and centrifugal forces"),
-    ("J", "output", "task joint", "", None, "Jacobian of {frame}: rows as of the target, columns as of the joints"),
-    ("drift", "output", "task", "m/s2|rad/s2", None, "acceleration of {frame} without that of joints, dJ/dt v"),
-    ("tau", "output", "joint", "N|N.m", None, "control effort applied"),
-    ("q_meas", "output", "joint", "m|rad", None, "position that the controller saw"),
-    ("v_meas", "output", "joint", "m/s|rad/s", None, "velocity that the controller saw"),
-    ("der_q", "local", "joint", "m/s|rad/s", None, "velocity, the position's derivative"),
+    ("M", "output", "joint pair", "", None, "mass matrix with payload and armature, in SI units"),
+    ("h", "output", "joint", "N|N.m", None, "torque or force of gravity, Coriolis and centrifugal effects"),
+    ("J", "output", "task joint", "", None, "Jacobian of {frame}: one row for each target, one column for each joint"),
+    ("drift", "output", "task", "m/s2|rad/s2", None, "acceleration of {frame} at zero joint accelerations, dJ/dt v"),
+    ("tau", "output", "joint", "N|N.m", None, "applied control torque or force"),
+    ("q_meas", "output", "joint", "m|rad", None, "position that the controller measured"),
+    ("v_meas", "output", "joint", "m/s|rad/s", None, "velocity that the controller measured"),
+    ("der_q", "local", "joint", "m/s|rad/s", None, "velocity"),
     ("der_v", "local", "joint", "m/s2|rad/s2", None, "acceleration"),
-    ("q_start", "parameter", "joint", "m|rad", None, "position at the start"),
-    ("v_start", "parameter", "joint", "m/s|rad/s", 0.0, "velocity at the start"),
-    ("q_min", "parameter", "joint", "m|rad", None, "lower limit"),
-    ("q_max", "parameter", "joint", "m|rad", None, "upper limit"),
+    ("q_start", "parameter", "joint", "m|rad", None, "initial position"),
+    ("v_start", "parameter", "joint", "m/s|rad/s", 0.0, "initial velocity"),
+    ("q_min", "parameter", "joint", "m|rad", None, "lower position limit"),
+    ("q_max", "parameter", "joint", "m|rad", None, "upper position limit"),
     ("gravity", "parameter", "root", "m/s2", (0.0, 0.0, -9.81), "gravity"),
     ("payload", "parameter", "", "kg", 0.0, "point mass at {frame}"),
-    ("payload_com", "parameter", "frame", "m", 0.0, "where the payload is"),
-    ("rcond", "parameter", "", "", 0.01, "singular values up to rcond times the largest are dropped"),
+    ("payload_com", "parameter", "frame", "m", 0.0, "position of the payload"),
+    ("rcond", "parameter", "", "", 0.01, "the pseudo-inverse of J drops singular values up to rcond times the largest"),
     ("rtol", "parameter", "", "", 1e-3, "relative tolerance of the integrator"),
     ("atol", "parameter", "", "", 1e-6, "absolute tolerance of the integrator"),
     ("max_step", "parameter", "", "s", 1e-3, "largest step of the integrator"),
-    ("friction", "parameter", "joint", "N|N.m", None, "Coulomb friction and stiction"),
+    ("friction", "parameter", "joint", "N|N.m", None, "Coulomb and static friction"),
     ("damping", "parameter", "joint", "N.s/m|N.m.s/rad", None, "viscous friction"),
-    ("armature", "parameter", "joint", "kg|kg.m2", 0.0, "inertia of the rotor times gear ratio squared"),
+    ("armature", "parameter", "joint", "kg|kg.m2", 0.0, "rotor inertia times gear ratio squared"),
     ("control_period", "parameter", "", "s", 0.0, "sampling period of the controller, 0 for a continuous one"),
-    ("control_delay", "parameter", "", "s", 0.0, "time from a sample to the effort that it commands"),
+    ("control_delay", "parameter", "", "s", 0.0, "delay from a sample to the effect of its command"),
     ("q_resolution", "parameter", "joint", "m|rad", 0.0, "resolution of the position sensor"),
     ("q_noise", "parameter", "joint", "m|rad", 0.0, "standard deviation of the position sensor's noise"),
     ("v_noise", "parameter", "joint", "m/s|rad/s", 0.0, "standard deviation of the velocity sensor's noise"),
     ("seed", "parameter", "", "", 0, "seed of the sensors' noise"),
-    ("integrator", "parameter", "", "", 0, "integrator: 0 automatic, 1 Dormand-Prince, 2 for stiff joints"),
-    ("v_from_q", "parameter", "", "", False, "the controller's velocities are differences of its positions"),
-    ("limit_effort", "parameter", "", "", False, "limit the control effort to the URDF's effort limits"),
-    ("rigid_stops", "parameter", "", "", None, "joint stops act on the other joints too"),
-    ("payload_known", "parameter", "", "", False, "the controller knows the payload"),
+    ("integrator", "parameter", "", "", 0, "integrator: 0 automatic, 1 Dormand-Prince, 2 ROS34PW2 for stiff joints"),
+    ("v_from_q", "parameter", "", "", False, "compute measured velocities as differences of measured positions"),
+    ("limit_effort", "parameter", "", "", False, "limit control torques and forces to the URDF's effort limits"),
+    ("rigid_stops", "parameter", "", "", None, "a joint stop reacts on all joints; otherwise it clamps its own joint"),
+    ("payload_known", "parameter", "", "", False, "the controller's model includes the payload"),
 )
 """Group; causality; owners of the elements ("" for a scalar); unit, or units for a prismatic | a revolute joint; start
 value (None if it is computed, given by the robot or the control law, or a target); and description.
@@ -295,7 +295,7 @@ def controller_table(table: Sequence[Variable]) -> list[Variable]:
             start = starts[f"{variable.group}_start", variable.index]
             variable = replace(variable, causality="input", start=start)
         elif variable.group == "tau":
-            text = variable.description.replace("control effort applied", "effort of the controller")
+            text = variable.description.replace("applied control", "commanded")
             variable = replace(variable, called="tau_cmd", description=text)
         rows.append(variable)
     return rows
@@ -327,7 +327,7 @@ def _count_task_rows(robot: Robot, law: Control) -> int:
 
 
 def count_event_indicators(robot: Robot, control: str) -> int:
-    """Count the event indicators of Model Exchange: three per joint, and droppable singular values."""
+    """Count the event indicators of Model Exchange: three per joint, and one per singular value that J⁺ may drop."""
     law = CONTROLS[control]
     rows = _count_task_rows(robot, law) if "rcond" in law.parameters else 1
     return 3 * len(robot.joints) + rows - 1
