@@ -1,4 +1,4 @@
-"""Exceptions of the package with a common root, and remedies for their messages.
+"""Exceptions of the package, and the remedies in their messages.
 
 Each message is one line with the culprit and the remedy.
 """
@@ -16,8 +16,8 @@ from itertools import islice
 from os import PathLike, scandir
 from pathlib import Path
 
-MAX_COMPARED = 2_000_000  # characters of all names that are compared with one, in a second
-LIKELY, LONGEST = 100, 100  # of these, names in which also the order counts, and characters, whose cube is the time
+MAX_COMPARED = 2_000_000  # characters of all known names: their comparison takes a second
+LIKELY, LONGEST = 100, 100  # names that are compared in full, and their length: the time grows with its cube
 MAX_LISTED = 4000  # characters of the names in a message
 MOST_NEIGHBOURS = 1000  # files of a folder among which the nearest name is searched
 KINDS = {
@@ -50,7 +50,7 @@ class TwoDofError(Exception):
 
 
 class BuildError(TwoDofError):
-    """The FMU cannot be built because of the URDF, its meshes, an option or the compiler."""
+    """An FMU cannot be built: the URDF, its meshes, an option or the compiler is at fault."""
 
 
 class FmuError(TwoDofError):
@@ -58,7 +58,7 @@ class FmuError(TwoDofError):
 
 
 class SspError(FmuError):
-    """The connections of a system are not those that SSP 1.0 allows."""
+    """The connections of a system violate SSP 1.0."""
 
 
 class InputError(TwoDofError):
@@ -151,30 +151,23 @@ def kind_of(path: Path) -> str:
 
 
 def path_of(value: object, wanted: str) -> Path:
-    """Return the path of a file or folder.
-
-    Raises:
-        TypeError: the value is not a path; the message names what it is the path of.
-    """
+    """Return a value as the path of a file or folder of the kind ``wanted``; raise TypeError if it is no path."""
     if not isinstance(value, str | PathLike):
         raise TypeError(f"{value!r:.50} is not a path; give the path of the {wanted}")
     return Path(value)
 
 
 def no_such(wanted: str, path: Path, *others: str) -> str:
-    """Return the message for a path of the wrong kind or without a file: its kind, or a similar path.
+    """Return the message for a path that does not exist, or has another kind than ``wanted`` and ``others``.
 
-    Args:
-        wanted: the kind that is wanted, a key of ``KINDS``.
-        path: the path.
-        others: further kinds that would do.
+    Kinds are keys of ``KINDS``. The message has a remedy: the command for the path's kind, or a similar path.
     """
     near = neighbour(path, wanted, *others)
     if others:
         wanted = f"{', '.join([wanted, *others[:-1]])} or {others[-1]}"
     words, command = KINDS.get(kind_of(path), ("", ""))
     if words:
-        use = f"; '{command} {shlex.quote(str(path))}' takes it" if command else ""
+        use = f"; use '{command} {shlex.quote(str(path))}'" if command else ""
         article = "an" if wanted.startswith("FMU") else "a"
         return f"'{path}' is not {article} {wanted}: it is {words}{use}"
     if not path.parent.is_dir():

@@ -25,12 +25,12 @@ from .printing import busy, print_next, print_table, quote, say, written
 
 def add(build: Parser) -> None:
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
-    add_output(build, "FILE.fmu", "default: <name>.fmu; - is the standard output", output_file)
+    add_output(build, "FILE.fmu", "output file (<name>.fmu); - is the standard output", output_file)
     option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the shipped planar 2-DoF arm)")
     text = "robot of an installed package, such as panda; --list-robots prints them"
     option("--robot", dest="stock", type=not_empty, metavar="NAME", help=text)
     flag("--list-robots", help="print the names of these robots")
-    option("--urdf", type=Path, metavar="U", help="another spelling of the URDF argument")
+    option("--urdf", type=Path, metavar="U", help="same as the argument URDF")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="omit the URDF's meshes from the FMU")
     text = "controlled link (EndEffector, or the last link, if there is only one)"
@@ -44,20 +44,20 @@ def add(build: Parser) -> None:
     option("--control", choices=("task", "joint", "effort"), default="task", help=text)
     text = "robot under its control law, or the control law alone, as a native FMU (%(default)s)"
     option("--part", choices=("all", "controller"), default="all", help=text)
-    text = "add a clock input that samples the controller, for tools with event mode (--part controller --fmi 3)"
+    text = "let an input clock sample the controller, for tools with event mode (--part controller --fmi 3)"
     flag("--clocked", help=text)
     text = "build plant and controller as two native FMUs, connected in an SSP file"
     option("--split", action="store_const", dest="part", const="split", help=text)
-    text = "further outputs: mass matrix, nonlinear effects, Jacobian, or its drift"
+    text = "add outputs: mass matrix M, nonlinear effects h, Jacobian J, drift dJ/dt v"
     option("--with", dest="outputs", nargs="+", choices=("M", "h", "J", "drift"), default=[], help=text)
-    text = "make a native FMU's parameter an input, with derivatives: gravity, payload, payload_com, 'friction[*]',"
+    text = "make a parameter an input, with derivatives (--native): gravity, payload, payload_com, 'friction[*]',"
     text += " 'damping[*]', 'armature[*]', mass:LINK, com:LINK, inertia:LINK; repeatable"
     build.add_repeatable("--free", metavar="P", help=text)
-    flag("--orientation", help="control the frame's orientation and position")
+    flag("--orientation", help="control the frame's orientation too")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
-    flag("--overwrite", help="replace an existing file; the default arm's FMU does not need it")
-    flag("--link-environment", help="store the path of this Python's packages in the FMU")
+    flag("--overwrite", help="replace an existing file (without it, only the default arm's FMU is replaced)")
+    flag("--link-environment", help="store the paths of this Python's packages in a Python FMU")
     _add_native(build)
 
 
@@ -74,7 +74,7 @@ def _add_native(build: Parser) -> None:
     )
     option("--fmi", type=int, choices=(2, 3), help="FMI version of a native FMU (2; 3 on Linux aarch64)")
     flag("--reference", help="add experiments with reference trajectories, for 'twodof check'")
-    text = "declare a variable for each element of a vector in FMI 3, for tools that do not support arrays"
+    text = "declare a scalar for each element of a vector, for FMI 3 tools without arrays"
     flag("--scalars", help=text)
 
 

@@ -8,10 +8,10 @@ from .printing import busy, print_json, print_table, say
 
 
 def add(check: Parser) -> None:
-    check.description = "Check an FMU of any vendor; exit status 1 if a row fails."
+    check.description = "Check an FMU of any vendor; exit with status 1 if a test fails."
     check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0, or SSP file")
     tools = ("fmpy", "libcosim", "ecos", "fmuloader", "pathsim")
-    text = "run the FMU's references in this FMI tool too; repeatable"
+    text = "also run the reference experiments in the FMU with this FMI tool; repeatable"
     check.add_repeatable("--with", dest="tools", choices=tools, help=text)
     add_options(check, "--json")
 

@@ -14,7 +14,7 @@ def add(export: Parser) -> None:
         " of a LeRobot dataset."
     )
     export.add_argument("bags", metavar="BAG", type=Path, nargs="+", help="folder of the bag; several for .lerobot")
-    text = "output: .csv or .mcap, with the extra 'sweep' .parquet or a folder .lerobot"
+    text = "output: .csv or .mcap; with the extra 'sweep' also .parquet, or a folder .lerobot"
     export.add_argument("-o", dest="output", required=True, type=not_empty, metavar="FILE", help=text)
 
 

@@ -86,7 +86,7 @@ MEANT = {
     }.items()
     for word in words.split()
 }
-"""The corresponding verb or option for those of other tools."""
+"""Verbs and options of this program, by those of other tools."""
 COMPLETION = 'completion in bash and zsh: eval "$(register-python-argcomplete twodof)"'
 
 

@@ -241,7 +241,7 @@ def _print_bag(run: Recording, verdict: Verdict | None) -> None:
 
 
 def _verdicts_of(runs: Sequence[Recording]) -> list[Verdict | None]:
-    """Return the stored verdicts of a bag's robots; for those without one, that of their samples if there are few."""
+    """Return the verdicts of a bag's robots: the stored ones, or those of the samples if there are few."""
     from ..bag.reader import read_bags
 
     stored = [run.stored_verdict for run in runs]

@@ -12,8 +12,8 @@ from .view import address, open_page
 
 def add(live: Parser) -> None:
     live.description = "Step an FMU in real time behind a page in the browser: drag the target."
-    add_fmu(live, "the default arm's", "FMU")
-    add_output(live, "BAG", "name of the recorded bags")
+    add_fmu(live, "the default arm's FMU", "FMU")
+    add_output(live, "BAG", "name of the recorded bags (rosbag2_<date and time>)")
     add_options(live, "--step", "--set", *OF_A_PAGE)
 
 

@@ -132,7 +132,7 @@ OPTIONS: Table = {
         action="append",
         default=[],
     ),
-    "--robot": dict(default="", metavar="NAME", help="robot's component in a system of FMUs"),
+    "--robot": dict(default="", metavar="NAME", help="component of an SSP file that is the robot"),
     "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's default)"),
     "--namespace": dict(default="", metavar="NS", help="namespace of the topics"),
@@ -152,7 +152,7 @@ def add_options(parser: Parser, *names: str) -> None:
 
 def add_fmu(parser: Parser, default: str, metavar: str = "FMU|URDF") -> None:
     """Add the optional FMU or URDF to run."""
-    parser.add_argument("fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}")
+    parser.add_argument("fmu", nargs="?", type=not_empty, metavar=metavar, help=f"model to use ({default})")
 
 
 def add_output(parser: Parser, metavar: str, text: str, kind: Callable[[str], str] = folder) -> None:
@@ -163,12 +163,12 @@ def add_output(parser: Parser, metavar: str, text: str, kind: Callable[[str], st
 def add_robot_options(parser: Parser) -> None:
     """Add the options for the robot of a third-party bag."""
     parser.add_argument("--urdf", type=not_empty, metavar="U", help="URDF of the robot, for a bag without one")
-    text = "end effector of that robot"
+    text = "end-effector link in this URDF"
     parser.add_argument("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
 
 
 def given_options(options: argparse.Namespace, *names: str) -> Keywords:
-    """Return keyword arguments for the library from the options of the same meaning."""
+    """Return options as keyword arguments of the library."""
     return {name: getattr(options, name) for name in names}
 
 

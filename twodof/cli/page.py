@@ -14,7 +14,7 @@ def add(page: Parser) -> None:
         " target to drag. It needs no network and no server."
     )
     add_fmu(page, "the default arm's native FMU")
-    add_output(page, "FILE.html", "default: <name>.html; - is the standard output", output_file)
+    add_output(page, "FILE.html", "output file (<name>.html); - is the standard output", output_file)
     add_options(page, "--frame", "--step", "--set")
 
 

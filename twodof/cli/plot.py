@@ -22,7 +22,7 @@ def add(plot: Parser) -> None:
         " sweep, each metric over the variables."
     )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="bags to draw; several are compared")
-    text = "file: .png, .svg, .pdf or .html; - is the standard output, as PNG (a window opens)"
+    text = "output file .png, .svg, .pdf or .html (opens a window); - is the standard output, as PNG"
     add_output(plot, "FILE", text, output_file)
     plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)", completer=joints)
     add_options(plot, "--cost")

@@ -28,7 +28,7 @@ def add(publish: Parser) -> None:
         " ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and CYCLONEDDS_URI."
     )
     option, flag = publish.add_argument, partial(publish.add_argument, action="store_true")
-    text = "default: TwoDof.fmu, built if it is missing; several are stepped together, each in a namespace"
+    text = "FMUs to step together, each in its namespace NAME (TwoDof.fmu, built if it is missing)"
     option("robots", nargs="*", metavar="[NAME=]FMU|URDF", help=text)
     add_output(publish, "BAG", "also record a bag, one for all robots")
     add_options(publish, "--frame")
@@ -45,10 +45,10 @@ def add(publish: Parser) -> None:
     flag("--lockstep", help="wait before each step for the command with the stamp of the latest state")
     text = "time without a command, s, until --on-timeout applies (0.5) or a lockstep run ends (10)"
     option("--timeout", type=float, metavar="S", help=text)
-    text = "at the time-out, hold the last command, or ramp it to zero (hold targets, ramp efforts)"
+    text = "at the time-out, hold the last command, or ramp efforts to 0 (hold for targets, ramp for efforts)"
     option("--on-timeout", choices=("hold", "ramp"), help=text)
     flag("--clock", help="publish /clock, and subscribe to /pause and /step")
-    option("--speed", type=float, metavar="FACTOR", help="multiple of real time (1; in lockstep unlimited)")
+    option("--speed", type=float, metavar="FACTOR", help="simulated seconds per second (1; in lockstep no limit)")
     add_options(publish, *OF_A_RUN)
     publish.set_defaults(storage=None)
 

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 def add(run: Parser) -> None:
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
-    add_output(run, "BAG", "default: rosbag2_<date and time>")
+    add_output(run, "BAG", "folder of the bag (rosbag2_<date and time>)")
     add_options(run, "--stop-time", "--step")
-    run.add_argument("--measured", action="store_true", help="record measured and true joint states")
-    run.add_argument("--signals", action="store_true", help="record all real outputs of an FMU or a system's FMUs")
+    run.add_argument("--measured", action="store_true", help="record what sensors measure, and the true joint states")
+    run.add_argument("--signals", action="store_true", help="record all real outputs of all FMUs")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run, "TwoDof.fmu, built if it is missing", "FMU|SSP|URDF")
     add_options(run, "--robot", "--frame", *OF_A_RUN)
-    text = "condition on the verdict that ends with exit status 3, such as 'error > 1e-3' or 'saturated > 0.1'"
+    text = "exit with status 3 if the condition holds, such as 'error > 1e-3' or 'saturated > 0.1'; repeatable"
     run.add_repeatable("--fail-if", metavar="CONDITION", help=text)
 
 

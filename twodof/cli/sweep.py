@@ -41,7 +41,7 @@ def add(sweep: Parser) -> None:
         " the native FMU of the default arm is used."
     )
     option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
-    add_fmu(sweep, "the default arm's", "FMU")
+    add_fmu(sweep, "the default arm's FMU", "FMU")
     varied = partial(sweep.add_repeatable, completer=variables)
     text = "evenly spaced values; several variables give all combinations"
     varied("--grid", dest="grids", metavar="NAME=LOW:HIGH:COUNT", help=text)
