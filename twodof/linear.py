@@ -140,7 +140,7 @@ def linearise(
 
 
 def _values(fmu: Fmu, given: Mapping[str, Setting]) -> dict[str, Value]:
-    """Return the values of inputs and parameters, with a state or its element as the parameter that sets it."""
+    """Return the values of inputs and parameters; states are replaced by the parameters that set them."""
     values: dict[str, Value] = {}
     for name, value in given.items():
         group, bracket, index = name.partition("[")

@@ -20,8 +20,8 @@ def ignore(*_: object) -> None:
 def with_keywords_of(*delegates: Callable[..., object], name: str = "") -> Callable[[Function], Function]:
     """Return a decorator that shows and checks the delegates' keywords of a function with ``**options``.
 
-    Type checkers know the keywords by PEP 692, ``help`` and editors by this. A call with another keyword raises a
-    TypeError that names the function.
+    This decorator tells ``help`` and editors the keywords; type checkers know them by PEP 692. A call with another
+    keyword raises a TypeError that names the function.
 
     Args:
         delegates: functions whose keywords the function accepts.

@@ -18,8 +18,7 @@ def storage_files(folder: Path) -> list[Path]:
     A single MCAP file, as pages and other tools write it, is a bag too.
 
     Raises:
-        BagError: a file is a link, as an untrusted bag could name any file of this machine, a pipe or device, or almost
-            without content.
+        BagError: a file is sparse, a pipe, a device, or a link, which could name any file of this machine.
     """
     if folder.suffix == ".mcap" and folder.is_file():
         _check_content(folder)
@@ -36,7 +35,7 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def _check_content(path: Path) -> None:
-    """Refuse a sparse file: a few bytes can have a terabyte of zeros."""
+    """Refuse a sparse file: a terabyte of its zeros needs no room on the disk."""
     state = path.lstat()
     used = 512 * state.st_blocks  # 0 on file systems without blocks
     if state.st_size > MAX_CHUNK + MAX_HOLLOW * used and (used or "-" in path.suffix):
@@ -51,7 +50,7 @@ def stated_count(folder: Path) -> int | None:
 
 
 def read_messages(file: Path, budget: ReadBudget) -> Iterator[Batch]:
-    """Read all messages of a file; those of a channel that have equal lengths are in order.
+    """Read all messages of a file; the order is kept among messages of one channel and length.
 
     Raises:
         DamageError: the file is truncated or damaged.

@@ -103,7 +103,7 @@ class JointStates:
         return names
 
     def _decode_one(self, message: Rows) -> tuple[str, list[Array]]:
-        """Return the frame and the numbers of a message, whose joints must be the first one's."""
+        """Return the frame and the numbers of a message, whose joints must be those of the first message."""
         self._odd += message.nbytes
         if self._odd > MAX_ODD:
             raise BagError(f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form")
@@ -151,7 +151,7 @@ class Targets:
         self._stamps, self._points = array("q"), array("d")
 
     def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Add PointStampeds, or PoseStampeds, which begin alike."""
+        """Add PointStampeds, or PoseStampeds, which begin with the same fields."""
         try:
             frame, points = unpack_points(messages)
         except (MixtureError, IndexError, struct.error):

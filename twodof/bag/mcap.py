@@ -73,7 +73,7 @@ def read_metadata(path: Path, name: str, key: str) -> str:
 
 
 def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) -> Iterator[Batch]:
-    """Return the messages of a chunk, those of a channel that have equal lengths together: a batch takes 20 µs.
+    """Return the messages of a chunk in batches of one channel and length; a batch takes 20 µs.
 
     If records repeat periodically, as in most bags of ROS 2, all of them are read at once. One by one, each would take
     a microsecond.

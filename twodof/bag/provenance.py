@@ -46,7 +46,7 @@ SHAPE = {
 }
 """Shape of a valid run.json, for ``fits``."""
 NAMES = ("name", "file", "robot", "frame", "root")
-"""Keys of the names in it and in its facts of the FMU."""
+"""Keys of run.json, and of its facts about the FMU, whose values are names."""
 
 
 class Provenance(TypedDict, total=False):
@@ -83,7 +83,7 @@ class Provenance(TypedDict, total=False):
 class ProvenanceFile:
     """run.json of a bag in progress, a valid file with all changes so far at any moment.
 
-    Only the commanders and the verdict follow the changes of inputs, so that adding a change rewrites few bytes.
+    The changes of inputs are almost at the end of the file, so that a further change rewrites few bytes.
 
     Raises:
         OSError: the file cannot be written. ``add`` raises it too, and can be called again.

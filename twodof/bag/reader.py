@@ -72,7 +72,7 @@ def read_all_ends(paths: Sequence[Path]) -> list[Recording]:
 
 
 def _ends(path: Path, summaries: Sequence[McapSummary]) -> Recording | None:
-    """Return the ends of a robot's joint states by the summaries; None if these do not decide on the topic."""
+    """Return a robot's first and last joint state; None if the summaries do not determine the topic."""
     robot, budget, counts = _Robot(path, Ends, None), ReadBudget(), Counter[tuple[str, str]]()
     for summary in summaries:
         for number, count in summary.counts.items():
@@ -105,7 +105,7 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 class _Robot:
-    """Joint states and targets of a robot, while its bag is read; with a downsampler, a choice of them."""
+    """Joint states and targets of a robot while its bag is read, downsampled on request."""
 
     def __init__(
         self, path: Path, kind: type[JointStates], targets: Targets | None, downsampler: Downsampler | None = None

@@ -52,8 +52,8 @@ def read_commands(
     Args:
         fmu: the commanded FMU, or its path.
         path: the bag's folder; for one of several robots, followed by a colon and its namespace.
-        topic: topic of the commands; None: the inputs in the bag's run.json, with initial inputs at time −∞, or
-            without run.json the only topic that can contain commands.
+        topic: topic of the commands; None: the inputs in run.json (initial ones at time −∞), or if there is none, the
+            only topic that can contain commands.
         step: communication step of the run, for trajectories, s; None: the FMU's default.
         settings: settings of the run: trajectories begin at rest at its q_des, or else at its q_start.
 
@@ -93,9 +93,9 @@ def read_commands(
 
 
 def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict[str, Stored], dict[str, int], int]:
-    """Return the messages that may be commands by topic, the first time of each topic of joint states, and a size.
+    """Return possible commands by topic, the first time of each topic of joint states, and the commands' bytes.
 
-    The size is that of the messages in memory. Those beyond MAX_COMMANDS_SIZE are left out.
+    Commands beyond MAX_COMMANDS_SIZE are left out.
     """
     size, topics = 0, dict[str, Stored]()
     begins: dict[str, int] = {}

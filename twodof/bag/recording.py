@@ -69,7 +69,7 @@ class ReceivedTargets:
 
 
 class Inputs:
-    """Inputs and parameters of a run over time; a bag has one for all its recordings, as the changes may be many."""
+    """Inputs and parameters of a run over time, evaluated once for all recordings of a bag."""
 
     def __init__(self, provenance: Provenance) -> None:
         self.provenance, self._columns = provenance, dict[tuple[str, ...], list[tuple[Steps, Array]]]()

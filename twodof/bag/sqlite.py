@@ -93,7 +93,7 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _authorize(action: int, table: str | None, _: str | None, __: str | None, view: str | None) -> int:
-    """Return whether a statement may do this: only read tables of ROS 2 and the schema, and through no view."""
+    """Return whether SQLite may do an action: read ROS 2's tables and the schema, but not through a view."""
     readable = action == sqlite3.SQLITE_READ and table in READABLE
     allowed = readable or action in (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_PRAGMA)
     return sqlite3.SQLITE_OK if allowed and view is None else sqlite3.SQLITE_DENY

@@ -286,7 +286,7 @@ def _quoted(text: str) -> str:
 
 @cache
 def profile(qos: Qos) -> str:
-    """Return a topic's quality of service in the form of bags."""
+    """Return a topic's quality of service as rosbag2's metadata state it."""
     return dump_qos_v8([qos])
 
 

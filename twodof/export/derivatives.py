@@ -63,7 +63,7 @@ def joint_frame(constant: Frame, position: Array, before: Frame) -> Frame:
 
 
 def joint_motion(frame: Frame, ratio: Array, rate: Sequence[Scalar], before: Sequence[Array]) -> list[Array]:
-    """Return s, ψ, χ, velocity and acceleration of a joint by its rates, after the motion before it."""
+    """Return s, ψ, χ, velocity and acceleration of a joint from its rates and the motion of its parent."""
     (R, origin), (velocity, acceleration) = frame, before
     z = R[:, 2]
     angular = z * ratio[0]

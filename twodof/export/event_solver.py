@@ -15,7 +15,7 @@ from ..plant.regime import DORMAND_PRINCE, Motion
 from .closed_form import Array
 
 SOON, MOST_EVENTS = 1e-11, 1000
-"""Time after an event at which the side of each bound is certain, s; and the most events in one call."""
+"""Time after an event, s, at which rounding no longer hides the sides of bounds; and the most events in one call."""
 
 
 def advanced(plant: Plant, h: float, method: str, tolerance: float) -> Array:

@@ -38,7 +38,7 @@ class FmuOptions:
             frame), "joint" or "effort".
         part: "all"; "controller": the control law alone, native, with inputs q and v and outputs tau_cmd; or "split":
             a system of plant and controller, two native FMUs in an SSP file.
-        clocked: whether an importer with event mode samples a controller alone with an input clock (FMI 3).
+        clocked: whether a controller has an input clock, by which an importer with event mode samples it (FMI 3).
         name: model name and identifier; "": name of the URDF's file, "TwoDof" for the shipped arm.
         link_environment: store the folders of this Python's packages in the FMU; not for the native
             flavour, which needs no Python.

@@ -17,12 +17,12 @@ START = ("q_start", "q_min", "q_max")
 """Variables on which the start value of q depends."""
 KNOWN = ("payload", "payload_com", "armature")
 INERTIAL = (*KNOWN, *OF_LINKS)
-"""Parameters that the mass matrix has, and of these those that the control law's mass matrix may have."""
+"""Parameters on which the mass matrix depends; KNOWN are those on which the control law's model may depend."""
 IMPACT = (*START, "v_start", *INERTIAL, "rigid_stops")
 """Variables on which the start value of v depends, because a velocity into a stop is removed."""
 OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
 Dependencies = tuple[Sequence[str], str] | tuple[Sequence[str], str, Sequence[str]]
-"""A group, its elements on which a variable depends, and groups of which it depends on the same element only."""
+"""Groups on which a variable depends, their elements, and groups of which it depends on its own element only."""
 SENSORS = ("q_resolution", "q_noise", "v_noise", "seed", "v_from_q")
 """Variables on which the first sample depends."""
 

@@ -85,7 +85,7 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
 def _is_known(path: Path, key: bytes) -> bool:
     """Return whether a file is the one that was built last for a key, by the digest in the user's own cache.
 
-    An FMU's code runs, so that what the file itself states does not count.
+    The FMU's code will run, so what the file states about itself is not trusted.
     """
     known = _known(key)
     digest = remembered(known) if known else None
@@ -180,7 +180,7 @@ def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str
 def _zipped(
     files: Mapping[str, bytes], comment: bytes = b"", finish: Callable[[], Mapping[str, bytes]] = dict
 ) -> bytes:
-    """Return a zip archive of files and of those that ``finish`` returns, which may replace others but resources.
+    """Return a zip archive of files and of those that ``finish`` returns, which may replace any but resources.
 
     Resources are compressed while ``finish`` runs, and therefore come first in the archive. Its directory is sorted.
     Entries have a fixed date, so that equal inputs give equal bytes.

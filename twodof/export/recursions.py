@@ -184,8 +184,7 @@ def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[A
     It factorises M = Lᵀ D L of the free joints from the last joint inwards, so that elements between branches of a tree
     stay 0. Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 6.5 and 9.2.
 
-    ``tau`` has τ of the free joints and else 0, ``held`` has a of the others and else 0, and ``free`` is 1 for free
-    joints and else 0.
+    ``tau`` is τ at free joints, ``held`` is a at the others, and ``free`` is 1 at free joints; elsewhere they are 0.
     """
     n = len(tau)
     L, u = M.copy(), np.array(tau, dtype=object)  # rows of D L replace those of M

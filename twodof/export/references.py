@@ -55,7 +55,7 @@ SAMPLED: dict[str, float] = {"control_period": PERIOD * STEP, "control_delay": D
 }  # fmt: skip
 """Parameters and inputs of "sample", by group. The loop is stable with these gains."""
 GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau", "q_meas", "v_meas", "der_q", "der_v")
-"""Groups with results in both experiments; outputs on request have results in "push"."""
+"""Groups with results in all experiments; outputs on request have results in "push" only."""
 PART = 0.01  # payload and rotors of "push", relative to the robot's inertia
 Columns = dict[str, Array]
 
@@ -173,7 +173,7 @@ def _load(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool
 
 
 def _rubbing(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool]:
-    """Return rigid stops, and the friction of joints that have none, rounded as in the file."""
+    """Return the parameters of "rest": rigid stops, and friction for all joints, rounded as in the file."""
     sizes = ACCELERATION * np.diag(plant.known.mass_matrix(np.array(plant.q)))
     values: dict[str, float | bool] = {n: True for n, v in names.items() if v.group == "rigid_stops"}
     of_joints = {n: v for n, v in names.items() if v.group == "friction"}

@@ -41,7 +41,7 @@ class Row(NamedTuple):
 
     @classmethod
     def of(cls, variable: ET.Element) -> "Row":
-        """Return the row of a variable of FMI 2.0, whose type is a child, or of FMI 3.0."""
+        """Return the row of a variable in a model description of FMI 2.0, where its type is a child element, or 3.0."""
         typed = next(iter(variable), variable)
         kind = next((two for two, three in FMI3_TYPES.items() if three == typed.tag), typed.tag)
         return cls(variable.get("causality", ""), kind, typed.get("start"))

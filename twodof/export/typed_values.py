@@ -15,7 +15,7 @@ from ..plant.variables import Value
 WHOLE = {f"Int{bits}": range(-(2 ** (bits - 1)), 2 ** (bits - 1)) for bits in (8, 16, 32, 64)}
 WHOLE |= {f"UInt{bits}": range(2**bits) for bits in (8, 16, 32, 64)}
 WHOLE |= {"Integer": WHOLE["Int32"], "Enumeration": WHOLE["Int64"]}
-"""Values of each type of whole numbers."""
+"""Ranges of the integer types."""
 LARGEST = {"Real": sys.float_info.max, "Float32": 3.4028234663852886e38}
 """Largest magnitude of each type of real numbers."""
 IN_FMI_3 = {kind: kind for kind in ("Float32", "Boolean", "String", *WHOLE)}

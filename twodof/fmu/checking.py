@@ -132,7 +132,7 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
 
 
 class _Task(NamedTuple):
-    """A trial, or the run of a reference in a tool, "" for this one."""
+    """A trial, or the run of a reference experiment in a tool ("": this master)."""
 
     trial: str
     reference: str = ""

@@ -15,8 +15,8 @@ from .trial import DELTA, Trial, UnpassedError
 PART = 0.37  # part of a step, at whose end a sampled controller takes no sample
 MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
 SMOOTH, EXACT = 1e-3, 1e-7
-"""Largest difference between the difference quotients of two widths with which a derivative is compared, and tolerance
-of the comparison in addition to it, both relative to the derivative's magnitude or to 1.
+"""A derivative is compared if the quotients of two widths differ by at most SMOOTH. The tolerance is this difference
+plus EXACT. Both are relative to the derivative's magnitude or to 1.
 """
 ULPS = 8.0  # spacings of numbers by which an output may be rounded
 Array = NDArray[np.float64]
@@ -26,8 +26,8 @@ class Slopes(NamedTuple):
     """Difference quotients of the unknowns over one variable.
 
     Attributes:
-        best: extrapolated from those of two widths.
-        doubt: difference of the two, and the effect of rounding.
+        best: quotients extrapolated from two widths.
+        doubt: difference between the quotients of the two widths, plus the effect of rounding.
     """
 
     best: Array
@@ -44,7 +44,7 @@ class Slopes(NamedTuple):
         return self.doubt <= SMOOTH * self.scale
 
     def differ(self, given: Array) -> NDArray[np.bool_]:
-        """Return where derivatives are not those of the differences."""
+        """Return where derivatives differ from the quotients."""
         return self.smooth & ~(np.abs(given - self.best) <= self.doubt + EXACT * self.scale)
 
 

@@ -122,7 +122,7 @@ class Fmu:
         return tuple(v.name for v in self.variables.values() if (v.causality, v.type) == ("output", "Real"))
 
     def remarks(self, asked: Iterable[str] = ()) -> list[str]:
-        """Return lines about a run with some settings; a system has them."""
+        """Return warnings about settings, one line each; only systems have some."""
         return []
 
     def vector(self, group: str) -> list[str]:
@@ -226,7 +226,7 @@ def problems_of(path: Path, inside: str = "") -> list[str]:
 
 
 def logged(fmu: Fmu) -> Fmu:
-    """Return an FMU with outputs q[i] and v[i], its joints named.
+    """Check an FMU with outputs q[i] and v[i]; return it with joint names.
 
     Raises:
         FmuError: it has no such outputs, or not as many as joints, or task vectors of a wrong length, or other units
@@ -276,7 +276,7 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
 
 
 def resource_reader(fmu: Fmu) -> Callable[[str], bytes | None]:
-    """Return a function that returns files of the FMU's resources/ folder, None without one; it keeps the FMU open."""
+    """Return a function that reads files in resources/, or returns None for a missing one; it keeps the FMU open."""
     archives, kept = list[zipfile.ZipFile](), ExitStack()
 
     def read(name: str) -> bytes | None:

@@ -107,7 +107,7 @@ class Element:
 
     Attributes:
         source: member of the archive with the component's FMU; "" for a system.
-        unsupported: messages about valid features for which no run is made.
+        unsupported: messages about valid SSP features that a run does not support.
         children, connections: elements inside a system, and its connections as XML elements.
     """
 

@@ -26,9 +26,8 @@ Start = float | bool | str
 class System(Fmu):
     """A system of co-simulation FMUs, one of which is the robot.
 
-    ``variables`` has by their own names the system's connectors, the robot's variables, and inputs whose name no other
-    component has. Other variables of components are "component.name". A variable that a connection drives has the
-    causality "local".
+    In ``variables``, connectors of the system, variables of the robot, and inputs with a unique name have their own
+    names; other variables are "component.name". A variable that a connection drives has the causality "local".
 
     Attributes:
         description: that of the robot's FMU, with the system's name, default experiment, and as GUID the SHA-256 of its

@@ -21,12 +21,12 @@ TRUE = ("true", "1")
 NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": TRUE.__contains__}
 """Supported types of variables, and functions that parse their start values."""
 TIMES = {"startTime": 0.0, "stopTime": math.inf, "stepSize": 1.0}
-"""Times of a default experiment, and values for those that it does not state."""
+"""Times of a default experiment, and their defaults."""
 SCALED = {"deg", "degree", "°", "deg/s", "rpm", "mm", "mm/s", "cm", "N.mm"}
-"""Names of units that are no SI units even if the description does not define them."""
+"""Unit names that are known not to be SI units, even if the description does not define them."""
 RELATIVE = "relativeQuantity"
 OF_TYPES = (RELATIVE, "quantity", "unit", "displayUnit", "min", "max", "nominal")
-"""Attributes whose defaults are those of the declared type: FMI 2.0.4, section 2.2.7."""
+"""Attributes that a variable inherits from its declared type: FMI 2.0.4, section 2.2.7."""
 PART = r"""([A-Za-z_]\w*|'([\w!#$%&()*+,\-./:;<>=?@\[\]^{}|~ ]|\\['"?\\abfnrtv])+')(\[\d+(,\d+)*\])?"""
 CONVENTIONS = {
     "flat": re.compile(r"[^\r\n\t]*"),
@@ -46,10 +46,10 @@ def is_plain_xml(xml: bytes) -> bool:
 
 
 def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescription:
-    """Return FMPy's model description of a modelDescription.xml, completed, with more of its checks.
+    """Check a modelDescription.xml; return FMPy's model description with the attributes that FMPy leaves out.
 
     Raises:
-        Exception: the description is not valid; a bare exception of one of several libraries.
+        Exception: the description is not valid; the type depends on the library that finds the fault.
     """
     if "fmiVersion" not in root.attrib:
         raise ValueError("it states no fmiVersion")
@@ -110,7 +110,7 @@ def problems_of_times(root: ET.Element) -> list[str]:
 
 
 def _check_texts(root: ET.Element) -> None:
-    """Raise ValueError for long texts of variables, types and units that others share, and many display units."""
+    """Raise ValueError for long texts that are copied for each use, and for many display units."""
     for path in ("UnitDefinitions//*", "TypeDefinitions//*", "ModelVariables//*"):
         for each in root.iterfind(path):
             for key, text in _shared_texts(each):
@@ -121,9 +121,9 @@ def _check_texts(root: ET.Element) -> None:
 
 
 def _shared_texts(each: ET.Element) -> Iterator[tuple[str, str]]:
-    """Yield texts that each use of a type or unit, or each element of an array, reads or copies.
+    """Yield texts that are copied for each use of a type or unit, or for each element of an array.
 
-    Descriptions are cut elsewhere, and the start value of a scalar String belongs to it alone.
+    They do not include descriptions, which are cut elsewhere, and the start value of a scalar String.
     """
     array = each.find("Dimension") is not None
     for key, text in each.items():

@@ -54,7 +54,7 @@ def nearest(
         target: position along the axes, m.
         quat: target orientation x, y, z, w; empty for any orientation.
         low, high: limits of the columns of q, rad or m, infinite without a limit.
-        q: first start, rad or m.
+        q: first initial guess of the joint positions, rad or m.
     """
     wanted = Rotation.from_quat(quat) if quat.size else None
     rows, joints = [*axes, *((3, 4, 5) if wanted else ())], [joint for _, joint in kinematics.parts(link)[0]]

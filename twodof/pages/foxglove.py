@@ -48,7 +48,7 @@ class Foxglove(Sink):
 
     Args:
         port: port; 0: any free port.
-        scene: also robot description, transforms, target and end effector.
+        scene: add the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         set_gains: allow programs of this user to set the gains; programs of other users are refused on Linux.
         opened: called when the server listens.

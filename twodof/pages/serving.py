@@ -203,7 +203,7 @@ def user_token() -> str:
 
 
 def lock_port(address: tuple[str, int], key: bytes) -> bool:
-    """Let only ``relay`` with this key connect to a port on which this process listens; return whether it is so.
+    """Let only ``relay`` with this key connect to a port on which this process listens; return whether Linux can.
 
     Linux then drops all TCP segments without the signature of RFC 2385, also of accepted connections.
     """

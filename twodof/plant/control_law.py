@@ -12,7 +12,7 @@ class ControlledPlant:
 
     Attributes:
         robot, control: the robot, and the name of its control law (a key of ``CONTROLS``).
-        known: the robot as its control law knows it.
+        known: the control law's model of the robot.
 
     Each group of variables is an attribute of the same name, in SI units: a list of floats for a vector, and a float,
     int or bool for a scalar. Task vectors are in the root frame.

@@ -31,9 +31,8 @@ their range.
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
 TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE = 2.0**-52, 2.0**-10, 2.0**-26
-"""Resolutions of the time of an event, as fractions of the step: of all events but a release, and the largest and the
-smallest of a release. There the acceleration is 0, so that the error of the state grows with the cube of that of the
-time.
+"""Resolutions of an event's time, as fractions of the step: for all events but a release; for a release, the coarsest
+and the finest. At a release the acceleration is 0, so that the state's error grows with the cube of the time's error.
 """
 TOGETHER, WINDOW, USUAL_RTOL = 2.0**-25, 2.0**-6, 1e-3
 """Fractions of the largest step. Joints that reach rigid stops within the first of an event stop with it. Joints

@@ -51,10 +51,7 @@ class Mechanism:
         self._position: Array = self._placement.translation
 
     def observe(self, q: Array, v: Array) -> tuple[list[float], list[list[float]], list[float]]:
-        """Return position, Jacobian (6 × n: linear, angular) and drift J̇ v (6) of the task frame.
-
-        In the root's axes.
-        """
+        """Return position, Jacobian (6 × n: linear, angular) and drift J̇ v (6) of the task frame, in root axes."""
         if self._G is not None:
             q, v = self._G @ q + self._c, self._G @ v
         model, data, frame = self._model, self._data, self._frame

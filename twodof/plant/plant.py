@@ -64,7 +64,7 @@ class Plant(ControlledPlant):
     ``der_q`` or ``der_v`` computes the value.
 
     Attributes:
-        known: the robot as its control law knows it.
+        known: the control law's model of the robot.
         time: time of the state, s.
         sampling: discrete state of the sampled controller and its sensors.
     """
@@ -204,7 +204,7 @@ class Plant(ControlledPlant):
 
     @property
     def drift(self) -> list[float]:
-        """Acceleration of the task without that of joints, J̇ v."""
+        """Acceleration of the task at zero joint accelerations, J̇ v."""
         drift = self._observed()[2]
         return [drift[row] for row in self._rows]
 
@@ -220,12 +220,12 @@ class Plant(ControlledPlant):
 
     @property
     def q_meas(self) -> list[float]:
-        """Positions that the controller saw at its latest sample, n values, rad or m."""
+        """Positions that the controller measured at its latest sample, n values, rad or m."""
         return self._settled().q_meas
 
     @property
     def v_meas(self) -> list[float]:
-        """Velocities that the controller saw at its latest sample, n values, rad/s or m/s."""
+        """Velocities that the controller measured at its latest sample, n values, rad/s or m/s."""
         return self._settled().v_meas
 
     def commanded_effort(self, q: Sequence[float], v: Sequence[float]) -> list[float]:
@@ -303,7 +303,7 @@ class Plant(ControlledPlant):
         return Stops(limits, self.friction, self._real.inverse_mass, self._acting_efforts, rigid=self.rigid_stops)
 
     def _acting_efforts(self, y: Sequence[float], a: Sequence[float]) -> Array:
-        """Return the magnitudes of the efforts on each joint, whose sum itself may be a rounding error, n values."""
+        """Return the sum of the efforts' magnitudes on each joint, n values; the efforts themselves may cancel."""
         q, v = np.array(y).reshape(2, -1)
         given = np.abs(self.tau_ext) + np.abs(np.multiply(self.damping, v))
         return np.asarray(given + self._real.effort_sizes(q, v, np.array(a), self.f_ext))

@@ -38,7 +38,7 @@ C = (
 )
 E = (0.2777499476479681, -1.403239895175999, 1.7726301276675507, 0.5)
 CUBIC = np.array([[0, 0, 0, 0], [1, -2, 1, 0], [0, 3, -2, 0], [0, -1, 1, 0], [0, 0, 0, 0]], float)
-"""Weights in the dense output, a cubic by both ends, of the derivatives that ``rosenbrock`` returns."""
+"""Weights of the derivatives that ``rosenbrock`` returns, in the dense output: a cubic through both ends."""
 STABLE, WORTH = 3.3, 12.0
 """Damping rate times step: up to STABLE, Dormand–Prince is stable; if the product with the largest step exceeds WORTH,
 this method is cheaper.

@@ -134,9 +134,9 @@ class Messages:
     """The messages of a run, serialised.
 
     Args:
-        scene: also robot description, transforms, target and end effector.
+        scene: add the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        clock: also the samples' stamps on /clock.
+        clock: add the samples' stamps on /clock.
         measured: /joint_states has the measured values; the true ones have their own topic.
 
     Attributes:

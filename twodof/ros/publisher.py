@@ -35,7 +35,7 @@ class Publisher(Sink):
 
     Args:
         network: the network settings, or an open domain; None: from the environment variables.
-        scene: also robot description, transforms, target and end effector.
+        scene: add the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         clock: also publish the samples' stamps on /clock, and subscribe to /pause and /step.
         namespace: namespace of all topics except /clock, /pause, /step and given names that begin with "/".

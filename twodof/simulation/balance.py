@@ -45,7 +45,7 @@ class Parts(NamedTuple):
     """Parts of the errors of the missed outputs late in a run.
 
     Attributes:
-        of: part of each cause, the mean of the outputs; empty if the equations of the robot are unknown, or if more
+        of: part of each cause, averaged over the outputs; empty if the equations of the robot are unknown, or if more
             than CLOSED remains without a cause.
         static: magnitude of the error that would remain without the motion, by output, m or rad.
     """
@@ -93,7 +93,7 @@ def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
 
 
 def _models(judge: Judge) -> dict[str, Dynamics]:
-    """Return the plant's model under "", and models in which each parameter after the other is the controller's."""
+    """Return the plant's model under "", and models with one more of the controller's parameters each."""
     own = controller_prefix(judge)
     payload, believed = payloads(judge)
     values: dict[str, Any] = {name: judge.given(name) for name in ("gravity", "payload_com", "armature")}

@@ -67,7 +67,7 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
 
 
 def _explains(judge: Judge, missed: Sequence[str]) -> bool:
-    """Return whether the inputs that changed last had most of the error before they changed."""
+    """Return whether most of the error before the latest change of inputs was due to these inputs."""
     if judge.latest is None or not missed:
         return False
     from .balance import parts_of_error  # as above

@@ -112,9 +112,9 @@ def experiment(
         start_time, stop_time, step: s; the stop time may be infinite. None: the FMU's default, or 0, 5 s and 10 ms.
         settings: start values by name; a vector has one value for all elements, or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
-        changes: instead of a file, times, s, and the inputs that change; earlier changes apply at the start.
+        changes: times, s, and the inputs that change, instead of a file; changes before the start apply at it.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
-        signals: whether samples and bags have all Real outputs, of a system those of all FMUs.
+        signals: whether samples and bags have all Real outputs, in a system those of all FMUs.
 
     Raises:
         InputError, FmuError: an argument or the FMU is invalid; the message names it.

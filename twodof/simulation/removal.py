@@ -25,12 +25,11 @@ CausesOf = Callable[[Judge], Sequence[Cause]]
 def by_removal(
     judge: Judge, missed: Sequence[str], why: Sequence[Cause], repeat: Repeat, causes_of: CausesOf
 ) -> tuple[tuple[Cause, ...], str]:
-    """Return the causes of a failed run, that without which the run has the smallest errors first.
+    """Return the causes of a failed run by the errors of the run without each of them, the smallest first.
 
-    Causes have the errors of the run without them. One that changes nothing is left out, and one that reduces the
-    error is noted; but if no cause alone changes anything, they keep their order. Causes that
-    keep an error in the run without the first one follow. The second result has the errors of the
-    run without all causes in words, or is "".
+    A cause that changes nothing is left out, and one that reduces the error is noted. If no cause alone changes
+    anything, the order is kept. Then follow causes of the error in the run without the first cause. The second result
+    is the errors of the run without all causes in words, or "".
 
     Args:
         missed: outputs that are not at their targets.
@@ -111,7 +110,7 @@ class _Trials:
         return None if plan is None else self._results.get(plan)
 
     def without_all(self, tried: Sequence[Cause]) -> float:
-        """Return the part of the error that the run without all causes has not."""
+        """Return the part of the error that is absent in the run without all causes."""
         result = self._without([self._plans[cause.text] for cause in tried if cause.removes is not None])
         return 0.0 if result is None else 1.0 - self._size(result) / self._size(self._judge)
 
@@ -207,7 +206,7 @@ def _is_open(cause: Cause) -> bool:
 
 
 def _rank(cause: Cause, left: float) -> float:
-    """Return the place of a cause by what it removes, or of one that was not tried, by what no other cause removes."""
+    """Return the sort key of a cause: what it removes, or if it was not tried, what no other cause removes."""
     if cause.noted:
         return inf
     untried = left if _is_open(cause) else 0.0
@@ -215,7 +214,7 @@ def _rank(cause: Cause, left: float) -> float:
 
 
 def _others(judge: Judge, missed: Sequence[str], why: Sequence[Cause]) -> list[Cause]:
-    """Return settings as causes that the balance of forces at the end does not show, beside those known."""
+    """Return further possible causes in the settings, which the balance of forces at the end does not show."""
     known = {(cause.kind, cause.subject) for cause in why}
     found = [
         *load(judge, 0.0),

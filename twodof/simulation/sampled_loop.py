@@ -40,7 +40,7 @@ def spectral_radius(Kp: float, Kd: float, period: float, delay: float, *, differ
 def stable_gains(
     Kp: float, Kd: float, period: float, delay: float, *, differences: bool = False
 ) -> tuple[float, float]:
-    """Return the largest gains Kp and Kd of the same damping ratio, below those of an unstable loop, with a stable one.
+    """Return the largest stable gains Kp and Kd below those given, which are unstable, at the same damping ratio.
 
     Return zeros if gains with a thousandth of the bandwidth √Kp give none. Arguments: as above.
     """

@@ -130,7 +130,7 @@ def setup(
 
 
 def _whole(starts: Mapping[str, float]) -> Mapping[str, float]:
-    """Return the start values of a system with those of its controller where the controller decides."""
+    """Return a system's start values, with its controller's values of parameters that act in the controller."""
     parts = [name.removesuffix("control_period") for name in starts if name.endswith(".control_period")]
     if len(parts) != 1:
         return starts

@@ -93,7 +93,7 @@ def stepped(
     """Yield the samples of a run; the judge receives the outputs of each as a buffer.
 
     With ``rows``, functions that receive rows of outputs, inputs must not change. Then only the first and the last
-    sample are made: a sample takes as long as a step of a fast FMU. The functions may come after the first one.
+    sample are made: a sample takes as long as a step of a fast FMU. Functions may be added after the first sample.
     """
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
@@ -212,7 +212,7 @@ def _sampler(
 
 
 def _maker(run: Experiment, ends: Sequence[int], first_stamp: int) -> Callable[..., Sample]:
-    """Return a function that makes the sample after k steps; outputs whose ends are beyond its values are empty."""
+    """Return a function that makes the sample after k steps; outputs that the FMU lacks are empty."""
     of_q, of_v, of_x, of_tau, *of_rest = (slice(a, b) for a, b in zip([0, *ends], ends))
     start, step = run.start_time, run.step
 

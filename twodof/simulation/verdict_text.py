@@ -73,15 +73,15 @@ def lines_of(
 
 
 def dropped(advice: re.Match[str]) -> str:
-    """Return the text that replaces advice which does not hold."""
+    """Return the text that replaces advice that a repeated run disproves."""
     return "; " if advice[2] else ""
 
 
 def _grouped(why: tuple[Cause, ...], count: int, worst: str) -> list[Cause]:
-    """Return one cause of each kind with the joints, of ``count``, of its others, and all causes without one.
+    """Merge causes of one kind at several of ``count`` joints; causes without a joint stay as they are.
 
-    It is that of the joint with the worst error, or else the first one. A joint that sticks has a time, and one that
-    creeps none. Errors without a cause stand beside the first cause that has them.
+    The text is that of the joint with the worst error, or else the first one. Joints that stick (with a time) and
+    joints that creep are different kinds. The same errors of a repeated run are printed once.
     """
     grouped: list[Cause] = []
     for cause in why:
@@ -100,9 +100,9 @@ def _grouped(why: tuple[Cause, ...], count: int, worst: str) -> list[Cause]:
 
 
 def _parts(why: tuple[Cause, ...]) -> dict[str, float]:
-    """Return the parts in the error that are printed, by kind or input: of several causes, none of them the whole.
+    """Return the parts of the error to print, by kind or input, if there are several causes and none exceeds the error.
 
-    After repetitions there are none: then the causes have errors.
+    After repetitions it is empty, because the errors of the repetitions are printed instead.
     """
     if any(cause.tried for cause in why):
         return {}
@@ -113,14 +113,14 @@ def _parts(why: tuple[Cause, ...]) -> dict[str, float]:
 
 
 def _of(cause: Cause) -> str:
-    """Return what has a part in the error: all forces of a kind, an input, or the motion."""
+    """Return the key of a cause's part in the error: the kind of force, the input, or "motion"."""
     return "motion" if cause.kind in MOVING else cause.subject or cause.kind
 
 
 def _completed(judge: Judge, cause: Cause, worst: str, parts: dict[str, float]) -> Cause:
     """Return a cause with its numbers in parentheses before its remedy.
 
-    They are the errors without it, or else its part in the error; and the error of its joint, if another one is worse.
+    They are the errors without the cause, or its part in the error, and its joint's error if another joint's is larger.
     """
     facts, part = [], parts.pop(_of(cause), None) if cause.part is not None else None
     if cause.joint and worst and cause.joint != worst and not cause.noted and cause.kind not in ("reach", "degrees"):

@@ -51,7 +51,7 @@ def assert_settles(run: Recording | str | Path, *, within: float) -> None:
 
 
 def _latest_error(bag: Recording, within: float) -> tuple[str, Array, int]:
-    """Return name, magnitudes and sample of the error that is largest for its band, a time after its target changed."""
+    """Return name, magnitudes and settling sample of the error that is largest relative to its initial value."""
     import numpy as np
 
     found: list[tuple[float, str, Array, int]] = []
