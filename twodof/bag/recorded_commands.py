@@ -148,7 +148,7 @@ def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read],
         except CommandError as error:
             t = (came - begin) / NANOSECONDS
             raise InputError(f"{bag}: the command at {t:g} s {error}") from error
-        if len(names) < LONGEST_NAME:  # a message may name thousands, which take three times its bytes
+        if len(names) < LONGEST_NAME:  # a message may have thousands of names, which take three times its bytes
             names.update(command.unknown_joints[:LONGEST_NAME])
         read_so_far.append((came, command._replace(unknown_joints=())))
     if names:

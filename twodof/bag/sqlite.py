@@ -26,8 +26,8 @@ TABLES = {  # ROS 2's tables and their columns; older versions lack the last one
 READABLE = {*TABLES, "sqlite_master"}
 STEPS = 1000  # instructions of SQLite's virtual machine: all for the schema, and one for each byte of the rows
 MAX_SQL = 4096  # characters of a table's definition; those of ROS 2 have some hundred
-MOST_LOST = 16  # size that a database states to that of its files, which a crash may have shortened
-SOME, SOME_BYTES = 1000, 16 * MIB  # rows in a group, and their size from which it ends
+MOST_LOST = 16  # ratio of a database's stated size to that of its files, which a crash may have shortened
+SOME, SOME_BYTES = 1000, 16 * MIB  # largest number of rows in a group, and the size at which a group ends
 
 
 def sqlite3_messages(path: Path) -> Iterator[Batch]:

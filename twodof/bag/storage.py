@@ -157,7 +157,7 @@ class Sqlite3Storage(Sqlite3Writer):
 
     def flush(self, sync: bool) -> None:
         """Pass all messages to the operating system, and with ``sync`` to the disk."""
-        if sync and not self.conn.in_transaction:  # new topics have opened one; the next flush waits
+        if sync and not self.conn.in_transaction:  # new topics have opened a transaction; the next flush waits
             self.conn.execute(SYNCHRONOUS[True])
         self.conn.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", self._rows)
         self.conn.commit()

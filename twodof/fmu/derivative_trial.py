@@ -12,7 +12,7 @@ from ..errors import SimulationError
 from .instance import Instance
 from .trial import DELTA, Trial, UnpassedError
 
-PART = 0.37  # part of a step, at whose end a sampled controller takes no sample
+PART = 0.37  # fraction of a step, after which a sampled controller takes no sample
 MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
 SMOOTH, EXACT = 1e-3, 1e-7
 """A derivative is compared if the quotients of two widths differ by at most SMOOTH. The tolerance is this difference

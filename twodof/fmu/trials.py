@@ -102,7 +102,7 @@ def two_instances(trial: Trial) -> str:
 
 
 def _other_values(trial: Trial, instance: Instance) -> Values:
-    """Return other values of inputs, real parameters and discrete variables; of each kind only if the FMU runs so."""
+    """Return other values of inputs, real parameters and discrete variables, of each kind if the FMU runs with them."""
     values: Values = {}
     for change in (trial.changed_inputs(), trial.changed_parameters(), trial.changed_discrete()):
         with suppress(SimulationError):

@@ -115,7 +115,7 @@ class Loop:
             self._rows.clear()
             self._count, self._number = 0, self._number + 1
             self._values = dict(self._run.start_values)
-            self._take(sample)  # atomically, so that no update describes a run without a sample
+            self._take(sample)  # in one assignment, so that no update describes a run without a sample
 
     def play(self, stop: Callable[[], bool]) -> None:
         """Step the FMU as pages request, until ``stop`` returns true."""

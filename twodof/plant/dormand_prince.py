@@ -40,7 +40,7 @@ HEUN = np.array([[1.0, -0.5, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0]])
 STAGES = 6
 """Evaluations of the right-hand side in one step."""
 FINEST_TOLERANCE = 2.0**-36
-"""Relative tolerance down to which steps share the tolerances. Below it, rounding would fail the error test."""
+"""Smallest relative tolerance that shared tolerances give. At smaller ones, rounding would fail the error test."""
 
 
 @lru_cache(maxsize=8)  # most steps have the same size

@@ -25,8 +25,8 @@ from .strokes import downsampled
 if TYPE_CHECKING:
     import pandas
 
-MOST_RUNS, MOST_VALUES = 20_000, 1_000_000  # runs on a page, and their values; else an evenly spaced selection
-MOST_NUMBERS = 2_000_000  # of all curves of a page; later runs have no curves
+MOST_RUNS, MOST_VALUES = 20_000, 1_000_000  # runs on a page, and their values; of more, an evenly spaced selection
+MOST_NUMBERS = 2_000_000  # points of all curves of a page; later runs have no curves
 MOST_CURVES, POINTS = 2000, 200
 """Number of runs whose curves a page contains, and of points in each curve."""
 
@@ -80,7 +80,7 @@ def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, ob
             lines = {name: bag.q[:, i] for i, name in enumerate(bag.joints)}
             if bag.x.size and bag.x.shape == bag.target.shape:
                 lines = {"distance from the target, m": np.linalg.norm(bag.x - bag.target, axis=1), **lines}
-            stored = bag.stored_verdict  # a run without one was killed, and judging 2000 takes minutes
+            stored = bag.stored_verdict  # a run without a verdict was killed, and judging 2000 takes minutes
         except BagError:
             continue
         drawn = {name: downsampled(values, POINTS) for name, values in lines.items()}

@@ -38,8 +38,8 @@ class Panel(NamedTuple):
         kind: quantity, one of KINDS.
         joint: name of the joint; "" for the error.
         unit: unit; "rad or m" if the robot is unknown.
-        strokes: curves of each track with this quantity, which have a kind; behind them targets, limits, and
-            the closed form of the error, if it is in the range.
+        strokes: curves of each track, which have a kind; behind them targets, limits, and the closed form of the error
+            if it is in the range.
         note: limits in words, or the note that an error is below the range.
         range: range of the axis, which contains the curves and nearby limits.
     """

@@ -137,7 +137,7 @@ def _draw(
 
 
 def _best_of_pair(table: pandas.DataFrame, counts: NDArray[np.bool_], panels: Sequence[_Panel]) -> pandas.DataFrame:
-    """Return the least value of each metric over all other variables; only runs that count have values."""
+    """Return the least value of each metric over all other variables, among the candidates."""
     pair = [panels[0].x, panels[0].y]
     values = {panel.metric: table[panel.metric].where(counts) for panel in panels}
     return table[pair].assign(**values).groupby(pair, as_index=False).min()

@@ -23,7 +23,7 @@ from .settings import settings_of
 AT_LIMIT = 1e-9  # tolerance relative to a limit
 NOTABLE = 1e-6  # m: smaller deviations from the closed form are integration errors
 MOST = 200_000  # drawn samples of a bag
-MOST_HELD = 20_000  # changes of inputs of a closed form, each of which takes 0.1 ms
+MOST_HELD = 20_000  # changes of inputs in a closed form; each takes 0.1 ms
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ class Layout:
         return rows
 
     def unpack(self, rows: Rows) -> list[Array] | None:
-        """Return the numbers of N messages, N × count each; None if other bytes differ."""
+        """Return the numbers of N messages, N × count each; None if the messages have another layout."""
         if rows.shape[1] != self.size or (rows[:, self._fixed] != self._plain[self._fixed]).any():
             return None
         return [np.ascontiguousarray(rows[:, where]).view("<f8").astype(np.float64) for where in self._numbers]

@@ -23,8 +23,8 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 TURNS_ON_PURPOSE = 6.0 * pi  # rad: a joint without limits may turn this far, if it reaches its target
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
-GROWN = 3.5  # logarithm of the growth of an unstable loop in a run that shows
-LASTING = 0.5  # part of an error in motion below which the error does not approach 0
+GROWN = 3.5  # logarithm of the growth from which on an unstable loop shows in a run
+LASTING = 0.5  # part of the error due to motion, below which the error does not approach 0
 TOGETHER = 2.0  # ratio of distances from which on position and orientation are out of reach only together
 EXPLAINED = 0.1  # part of an error that a target out of reach may leave to its consequences
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
@@ -81,7 +81,7 @@ def _explains(judge: Judge, missed: Sequence[str]) -> bool:
 
 
 def _weight(kind: str, subject: str, parts: Mapping[tuple[str, str], float]) -> float:
-    """Return the part of the error that a kind of cause has: all joints' for a force, and the motion's for a gain."""
+    """Return the part of the error due to a kind of cause: of all joints for a force, of the motion for a gain."""
     if kind in MOVING:
         return parts.get(("motion", ""), 0.0) + parts.get(("sampling", ""), 0.0)
     if kind in ("friction", "limit", "saturation"):
@@ -92,7 +92,7 @@ def _weight(kind: str, subject: str, parts: Mapping[tuple[str, str], float]) -> 
 def _by_parts(
     judge: Judge, missed: Sequence[str], found: Sequence[Cause], parts: Mapping[tuple[str, str], float]
 ) -> list[Cause]:
-    """Return the causes by their parts in the error, without those that are small; opposed forces are noted."""
+    """Return the causes by their parts in the error, without small ones; forces that reduce the error are noted."""
     beyond = max((cause.part or 0.0 for cause in found if cause.kind == "reach"), default=0.0)
     limits = _weight("limit", "", parts)
     bounds = limits + _weight("singularity", "", parts)
@@ -106,7 +106,7 @@ def _by_parts(
         own = _weight(cause.kind, cause.subject, parts)
         at_limit = bounds >= LASTING and abs(limits + own) < LASTING
         if cause.kind == "load" and own <= -LASTING and (thrown or at_limit):
-            return max(bounds, _weight("time", "", parts)) + LASTING  # it has brought the arm there, and acts away now
+            return max(bounds, _weight("time", "", parts)) + LASTING  # it moved the arm there, and now acts away
         if cause.kind in ("unstable", "sampling"):
             net = bounds + min(0.0, parts.get(("sampling", ""), 0.0))  # a stop also balances wrong efforts
             left = net - beyond if beyond > SMALL else bounds
@@ -142,7 +142,7 @@ def _by_kinds(judge: Judge, found: Sequence[Cause]) -> list[Cause]:
     """Return the causes in the order of their kinds, for runs whose forces are unknown."""
     motors, driven = max((cause.share for cause in found if cause.kind == "saturation"), default=0.0), _driven(judge)
 
-    def passing(cause: Cause) -> bool:  # a joint in the way saturates motors no longer
+    def passing(cause: Cause) -> bool:  # a joint at its limit no longer saturates motors
         return cause.kind == "limit" and (cause.share < motors or cause.joint in driven)
 
     causes = sorted(found, key=lambda each: ([*KINDS].index("drag" if passing(each) else each.kind), -each.share))

@@ -19,7 +19,7 @@ WEAK = 0.2  # damping ratio below which damping is too small
 FADING = 0.7  # ratio of mean speeds, of the second to the first half of the last samples, that shows a decay
 FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 GAINS = (("Kp", "Kd"), ("Kp_rot", "Kd_rot"))
-SPOILT = 0.5  # fraction of the rate of decay of a continuous controller below which the sampling is to blame
+SPOILT = 0.5  # fraction of a continuous controller's decay rate below which the sampling is a cause
 STILL = 1e-3  # fraction of the largest speed below which a joint is at rest
 OF_ERROR = 0.1  # part of the largest element of an error from which on an element counts
 GRAVITY = 9.81  # m/s²
@@ -154,7 +154,7 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     if controller_prefix(judge):  # the controller is a component, and acts at communication points
         sampling[0] = max(sampling[0], setup.step)
     continuous = bool(judge.aims) and not any(sampling) and not judge.moving and judge.given("Kp").size > 0
-    if len(v) < 16 or continuous:  # the steps of communication change nothing in a continuous law
+    if len(v) < 16 or continuous:  # communication steps have no effect on a continuous law
         return
     if any(sampling) and (found := [*_unstable(judge, *sampling)]):
         yield from found

@@ -13,9 +13,9 @@ from .controller_causes import GAINS, controller_prefix, payloads
 from .judge import Judge
 from .setup import OF_THE_CONTROLLER, Array
 
-LONGER = 10.0  # a run is repeated for at most this many times its duration more
-TURN = 6.0  # rad: larger joint targets, and whole numbers, are in degrees, if one is
-STIFFER = 10.0  # factor of Kp of a run that tries the advice to raise it, and divisor of one to lower it
+LONGER = 10.0  # largest additional duration of a repeated run, as a multiple of the run's duration
+TURN = 6.0  # rad: if one joint target is in degrees, larger ones and whole numbers are too
+STIFFER = 10.0  # factor of Kp in a run that tries the advice to raise it; divisor for the advice to lower it
 USUAL = {name: start for name, *_, start, _ in ROWS if isinstance(start, float)}
 SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
 

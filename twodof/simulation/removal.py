@@ -11,7 +11,7 @@ from .judge import OF_THE_END, Judge
 from .remedies import SAMPLING, STIFFER, Repetition, named, stiffer, unusual, without
 from .verdict_text import ADVICE, NEXT, dropped, unit_of_error, worst_joint
 
-LITTLE = 0.1  # part of the error; causes that remove less, each for itself, keep their order
+LITTLE = 0.1  # part of the error; if each cause removes less, their order is kept
 HALF = 0.5  # part of the error; if no cause removes as much, all other settings are tried
 WHOLE = 0.9  # part of the error whose removal explains all consequences
 

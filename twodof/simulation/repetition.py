@@ -19,7 +19,7 @@ from .setup import robot_of
 from .stepping import Stop, judge_of, stepped
 
 MOST_STEPS = 5000  # communication steps of a run that is repeated
-BUDGET = 6e7  # evaluations, times joints, in all repetitions of a run: about 5 s; independent of the load of a machine
+BUDGET = 6e7  # evaluations times joints in all repetitions of a run, about 5 s: independent of the machine's load
 TOO_LONG = "the run takes too long"
 
 

@@ -10,7 +10,7 @@ from .cause import FLOOR, Cause
 from .controller_causes import OF_ERROR, PERIODS, decay, gain_name, late_by, loops, rate_of, sensors_of
 from .judge import OF_THE_END, Judge
 
-SWINGING = 0.7  # damping ratio below which an error that shrinks once will grow again
+SWINGING = 0.7  # damping ratio below which a shrinking error will grow again
 
 
 def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> Iterator[Cause]:

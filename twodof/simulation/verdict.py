@@ -168,7 +168,7 @@ def verdict_in(facts: Mapping[str, Any]) -> Verdict:
     return Verdict(**{**known, "numbers": numbers, "causes": found, "lines": tuple(facts["lines"])})
 
 
-@np.errstate(over="ignore", invalid="ignore")  # large values within MAX_VALUE; what overflows is no cause
+@np.errstate(over="ignore", invalid="ignore")  # values below MAX_VALUE may still overflow; then there is no cause
 def conclude(judge: Judge, repeat: Repeat | None = None) -> Verdict:
     """Return the verdict of a judge's samples.
 

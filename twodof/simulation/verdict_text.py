@@ -11,12 +11,12 @@ from .cause import FLOOR, MOVING, SMALL, Cause, point_text
 from .controller_causes import STILL, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
 
-WHOLE = 0.995  # part of an error from which on parts are not printed: larger ones balance each other
+WHOLE = 0.995  # parts above this fraction of the error are not printed: they balance each other
 NEXT = "seen when the run is repeated without the first cause"
 ADVICE = re.compile(r"; (raise Kp|raise the gains|lower the gains)(, or |(?=$|;))")
 """Advice without a size; a repeated run may have shown that it helps."""
-MANY = 1.0  # overshoot, a fraction of the way, from which on its distance is printed
-RUNAWAY = ("diverged", "unstable")  # kinds whose consequences say nothing
+MANY = 1.0  # overshoot, as a fraction of the way, from which on it is printed as a distance
+RUNAWAY = ("diverged", "unstable")  # kinds of a first cause after which notes are not printed
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
 ERRORS = {"x": "position", "quat": "orientation", "q": "joints"}
 SWITCHES = ("payload_known", "limit_effort", "v_from_q")

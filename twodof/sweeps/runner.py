@@ -31,7 +31,7 @@ Row = tuple[Any, ...]
 
 BATCH_TIME = 0.25  # s, of one batch
 MAX_BATCH = 256
-MOST_DEATHS = 3  # deaths of a run's worker, two of them during batches of this run only
+MOST_DEATHS = 3  # deaths of a run's worker, two of them while it ran this run alone
 GIVEN_UP = "the process that ran it died, repeatedly"
 LOOK = 0.2  # s between two checks of ``stop``
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 REPORT: list[Path] = []
 """The report's folder, if any; the plugin appends it."""
-EXACT = 1e-9  # tolerance relative to a limit, for a joint held by its stop
+EXACT = 1e-9  # tolerance relative to a limit, for a joint at its stop
 
 
 def assert_settles(run: Recording | str | Path, *, within: float) -> None:
