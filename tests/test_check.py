@@ -330,7 +330,7 @@ def test_a_row_without_a_claimed_feature_does_not_apply(tmp_path: Path) -> None:
         "serialised state": "it does not state canGetAndSetFMUstate",
         "variable steps": "it does not state canHandleVariableCommunicationStepSize",
         "derivatives": "it does not state providesDirectionalDerivative",
-        "references": "it carries no experiments with results in the form of FMI-LS-REF",
+        "references": "the FMU contains no reference experiments (FMI-LS-REF)",
     }
 
 

@@ -188,12 +188,12 @@ TOO_MANY = "more than 50000 elements"
 LONG_NAMES = "names of its arrays' elements have more than 8388608 characters"
 ARRAYS = {
     "a billion": (arrays('start="1000000000"'), TOO_MANY),
-    "2^64 - 1": (arrays('start="18446744073709551615"'), "a dimension of no known size"),
+    "2^64 - 1": (arrays('start="18446744073709551615"'), "a dimension whose size is unknown"),
     "of another variable": (arrays('valueReference="9"'), TOO_MANY),
-    "of none": (arrays('valueReference="8"'), "a dimension of no known size"),
+    "of none": (arrays('valueReference="8"'), "a dimension whose size is unknown"),
     "a product": (arrays(*['start="300"'] * 2), TOO_MANY),
     "a billion times none": (arrays('start="0"', 'start="1000000000"'), TOO_MANY),
-    "with an underscore": (arrays('start="2_0"'), "a dimension of no known size"),
+    "with an underscore": (arrays('start="2_0"'), "a dimension whose size is unknown"),
     "20,000 dimensions": (arrays('start="49000"', *['start="1"'] * 20_000), "more than 16 dimensions"),
     "40,000 names": (arrays('start="40000"', aliases=40_000), TOO_MANY),
     "300,000 names of a scalar": (arrays(aliases=300_000), TOO_MANY),

@@ -396,7 +396,7 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
     [
         ("push-ref.csv", b"0.01,", b"0.01,x", "could not convert"),
         ("push-ref.csv", b"\n0.02,", b"\n0.02,1,", "cannot be read"),
-        ("push.ssv", b"ssv:Real", b"ssv:Complex", "is of type Complex, which is not set"),
+        ("push.ssv", b"ssv:Real", b"ssv:Complex", "is of type Complex, which cannot be set"),
         ("references.exp", b'"push.ssv"', b'"none.ssv"', "none.ssv"),
         ("references.exp", b'"push.ssv"', b'"' + b"%2e" * 2000 + b'"', "6000 characters; at most 4096 are supported"),
         ("references.exp", b'"push.ssv"', b'"../../../../etc/passwd"', "etc/passwd"),
@@ -573,10 +573,10 @@ def test_a_parameter_set_is_converted_to_the_units_of_the_fmu(tmp_path: Path) ->
 @pytest.mark.parametrize(
     "name, text, reason",
     [
-        ("e.csv", "time,seen\n0,3.7\n", "e.csv: 'seen' has a value that is no whole number of 32 bits"),
-        ("e.csv", "time,seen\n0,4294967299\n", "e.csv: 'seen' has a value that is no whole number of 32 bits"),
-        ("e.ssv", values("seen Integer 4294967299"), "e.ssv: 'seen' has a value that is no whole number of 32 bits"),
-        ("e.csv", "time,mode\n0,1\n", "e.csv: 'mode' is of type Enumeration, which is not set"),
+        ("e.csv", "time,seen\n0,3.7\n", "e.csv: 'seen' has a value that is not a 32-bit integer"),
+        ("e.csv", "time,seen\n0,4294967299\n", "e.csv: 'seen' has a value that is not a 32-bit integer"),
+        ("e.ssv", values("seen Integer 4294967299"), "e.ssv: 'seen' has a value that is not a 32-bit integer"),
+        ("e.csv", "time,mode\n0,1\n", "e.csv: 'mode' is of type Enumeration, which cannot be set"),
         ("e.csv", "time,seen\n0,1\n0.2,1\n0.1,1\n", "e.csv: its times do not ascend"),
     ],
 )

@@ -166,9 +166,9 @@ def test_the_command_line_gives_texts_items_and_large_numbers(fmus: dict[int, Pa
 
 
 REFUSED = [
-    (2, {"mode": 2}, "mode = 2 is no item of its enumeration; there are: slow (-3), fast (7), 2 (1)"),
-    (3, {"mode": "medium"}, "mode = 'medium' is no item of its enumeration; there are: slow (-3)"),
-    (2, {"mode": True}, "mode = True is no item of its enumeration"),
+    (2, {"mode": 2}, "mode = 2 is not in its enumeration; there are: slow (-3), fast (7), 2 (1)"),
+    (3, {"mode": "medium"}, "mode = 'medium' is not in its enumeration; there are: slow (-3)"),
+    (2, {"mode": True}, "mode = True is not in its enumeration"),
     (2, {"n": 6}, "n = 6 must be in [-5, 5]"),
     (2, {"n": 2.5}, "n = 2.5 must be a whole number of 32 bits"),
     (2, {"text": 3}, "text = 3: expected a text"),
@@ -235,8 +235,8 @@ def test_a_setting_of_a_system_on_the_command_line(fmus: dict[int, Path], tmp_pa
 @pytest.mark.parametrize(
     "row, message",
     [
-        ("mode Enumeration medium", "c.mode = 'medium' is no item of its enumeration; there are: slow (-3), fast (7)"),
-        ("mode Integer 2", "c.mode = 2 is no item of its enumeration"),
+        ("mode Enumeration medium", "c.mode = 'medium' is not in its enumeration; there are: slow (-3), fast (7)"),
+        ("mode Integer 2", "c.mode = 2 is not in its enumeration"),
         ("n Integer 6", "c.n = 6 must be in [-5, 5]"),
         ("n String 3", "the value of 'c.n', '3', is a String for another type: not supported"),
         ("mode String slow", "the value of 'c.mode', 'slow', is a String for another type: not supported"),

@@ -325,7 +325,7 @@ def parsed(text: bytes) -> Any:
 def fits(content: object, shape: object) -> bool:
     """Return whether a JSON value has a given shape and only finite numbers.
 
-    A shape is [x] for a list of any number of x, (x, y) for these two, {str: x} for x by any name, or a type.
+    A shape is a type, [x] for a list of x of any length, (x, y) for a list of an x and a y, or {str: x} for x by name.
     """
     if isinstance(shape, list):
         return isinstance(content, list) and all(fits(element, shape[0]) for element in content)

@@ -34,8 +34,7 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     "elbow.velocity" and "elbow.effort"; and for a task axis "y", "x.y" and "x_des.y". Unknown quantities have no
     column. Units are in the header of a CSV file, "elbow.position [rad]", and in the pandas attributes of a Parquet
     file. Values are in SI units, in full precision. An MCAP file has all messages, with the provenance as metadata. A
-    folder of the suffix .lerobot is a LeRobot dataset with an episode for each of several bags, with the joints'
-    positions and velocities as ``observation.state``, and as ``action`` the targets, or else the efforts.
+    folder with the suffix .lerobot is a LeRobot dataset (``lerobot.write_dataset``) with an episode for each bag.
 
     Raises:
         BagError: the bag is incomplete, the suffix is unknown, pandas or pyarrow is missing, or the file cannot be

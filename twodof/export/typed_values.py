@@ -77,5 +77,5 @@ class Type(NamedTuple):
                 number = whole_number(str(given))
         if isinstance(number, bool) or number not in self.items.values():
             there = ", ".join(f"{item} ({value})" for item, value in self.items.items())
-            raise InputError(f"{name} = {given!r:.50} is no item of its enumeration; there are: {there:.500}")
+            raise InputError(f"{name} = {given!r:.50} is not in its enumeration; there are: {there:.500}")
         return next(value for value in self.items.values() if value == number)

@@ -128,7 +128,7 @@ def _rows(path: Path, inside: str, tools: Sequence[str]) -> Iterator[Row]:
     runs = _runs(known, tools)
     yield from _tried(known, [*(_Task(name) for name in TRIALS), *runs])
     if not runs:
-        yield Row("references", "does not apply", "it carries no experiments with results in the form of FMI-LS-REF")
+        yield Row("references", "does not apply", "the FMU contains no reference experiments (FMI-LS-REF)")
 
 
 class _Task(NamedTuple):

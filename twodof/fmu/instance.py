@@ -161,8 +161,8 @@ class Instance:
     ) -> tuple[Callable[[], Values], Values, Values, list[int], list[int]]:
         """Return a function that reads or sets the vectors of Real variables, and returns their buffer.
 
-        Further results are the variables' buffer, which is that of the vectors if the variables are whole vectors, the
-        vectors' buffer, their value references, and the variables' indices.
+        Further results are the variables' buffer, the vectors' buffer, the vectors' value references, and the
+        variables' indices. The two buffers are one if the variables are whole vectors.
         """
         distinct, columns, size = self._columns(names)
         values = (c_double * len(columns))() if values is None else values

@@ -216,7 +216,7 @@ class _Files:
                     values[name] = self._in_own_unit(source, name, value, units.get(unit, Unit(unit)))
                     self._check(source, name, [values[name]])
                 elif kind != "Annotations":
-                    raise ValueError(f"{source}: parameter '{name}' is of type {kind}, which is not set")
+                    raise ValueError(f"{source}: parameter '{name}' is of type {kind}, which cannot be set")
         return values
 
     def _in_own_unit(self, source: str, name: str, value: float | bool, unit: Unit) -> float | bool:
@@ -241,9 +241,9 @@ class _Files:
         """Raise for values that a variable cannot have."""
         kind = self._fmu.variables[name].type if name in self._fmu.variables else "Real"
         if kind not in KINDS:
-            raise ValueError(f"{source}: '{name}' is of type {kind}, which is not set")
+            raise ValueError(f"{source}: '{name}' is of type {kind}, which cannot be set")
         if kind == "Integer" and not all(float(value).is_integer() and int(value) in WHOLE[kind] for value in values):
-            raise ValueError(f"{source}: '{name}' has a value that is no whole number of 32 bits")
+            raise ValueError(f"{source}: '{name}' has a value that is not a 32-bit integer")
 
     def table(self, source: str) -> Table:
         """Return the columns of a CSV file."""

@@ -30,12 +30,12 @@ class System(Fmu):
     names; other variables are "component.name". A variable that a connection drives has the causality "local".
 
     Attributes:
-        description: that of the robot's FMU, with the system's name, default experiment, and as GUID the SHA-256 of its
-            structure, its parameter sets, and the GUIDs and checksums of its FMUs.
+        description: description of the robot's FMU, with the system's name and default experiment. Its GUID is the
+            SHA-256 of the structure, the parameter sets, and the GUIDs and checksums of the FMUs.
         components: FMUs by full name.
         links: connections of components' variables with their first sources.
         batches: outputs and inputs in the order of evaluation at one instant.
-        initial: the same in initialisation mode.
+        initial: outputs and inputs in the order of evaluation in initialisation mode.
         recorded: name of the component that is the robot.
         places: the component's variable, or the system's connector, for each of ``variables``.
         bound: start values of components' variables from parameter bindings, also of connectors that pass them.

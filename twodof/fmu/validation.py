@@ -145,7 +145,7 @@ def _check_arrays(root: ET.Element) -> None:
         if len(texts) > MAX_DIMENSIONS:
             raise ValueError(f"variable '{name}' has more than {MAX_DIMENSIONS} dimensions")
         if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
-            raise ValueError(f"variable '{name}' has a dimension of no known size")
+            raise ValueError(f"variable '{name}' has a dimension whose size is unknown")
         elements = math.prod(max(1, int(text)) for text in texts)
         room -= elements * len(names) if dimensions else len(names) - 1
         letters -= elements * sum(map(len, names)) if dimensions else 0

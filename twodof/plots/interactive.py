@@ -27,8 +27,8 @@ POINTS = 120_000
 seconds, and the page has about 4 MB.
 """
 ROW, GAP, EDGE, TOP = 150, 34, 44, 50
-"""Pixels: height of a panel, distance between panels, and margins below the last panel and above the first, with space
-for heading and plotly's buttons.
+"""Height of a panel, distance between panels, and margins below and above all panels, pixels. The margin above has
+space for the heading and plotly's buttons.
 """
 Chart = dict[str, Any]
 """A figure of plotly, or a part of one, as JSON."""

@@ -87,8 +87,8 @@ def line_styles(names: Iterable[str]) -> list[LineStyle]:
 def downsampled(values: Array, most: int) -> Indices:
     """Return the indices of a limited number of samples that draw the same line (M4).
 
-    Of each part, the first, last, smallest and largest sample are kept, and both sides of the steepest rise and fall,
-    so that a jump remains a jump when the user zooms in. Parts are as short as the limit allows.
+    Each part keeps its first, last, smallest and largest sample, and both ends of its steepest rise and fall: a jump
+    remains a jump when the user zooms in. Parts are as short as the limit allows.
     """
     kept: Indices = np.arange(len(values))
     size = 1

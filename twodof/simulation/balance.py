@@ -115,9 +115,9 @@ def _models(judge: Judge) -> dict[str, Dynamics]:
 
 
 def _late(judge: Judge) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield q, v and τ at samples of the last quarter of the run and of the time since the last change of a target.
+    """Yield q, v and τ at samples of the last quarter of the run, but after the last change of a target.
 
-    For a target that moves, they are samples of the second half.
+    For a moving target, they are samples of the second half.
     """
     q, v, tau = (judge.history(name) for name in ("q", "v", "tau"))
     begin = 0.5 * judge.duration if judge.moving else max(judge.changed, 0.75 * judge.duration)
