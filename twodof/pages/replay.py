@@ -178,7 +178,7 @@ def view(
 
     Args:
         bag: the bag, or its folder.
-        stop: called 20 times a second.
+        stop: called 20 times a second; True ends the replay.
         opened: called with the URL and remarks when the page can be opened.
         host, port: address to listen on.
         robot: options of ``replay``.

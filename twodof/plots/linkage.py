@@ -46,7 +46,7 @@ class Motion:
 
 
 class Linkage(NamedTuple):
-    """Geometry, limits and damping of a robot for pictures; its masses may be invalid.
+    """Geometry, limits and damping of a robot for pictures, which may have invalid masses.
 
     Attributes:
         moving: independent joints, and joints that mimic them if the bag has these.

@@ -64,7 +64,7 @@ def samples(
 
     Args:
         run: the experiment, or an FMU together with options of ``experiment``.
-        pace: waits until the time of each sample.
+        pace: waits until the time of each sample, as ``RealTime`` does; None: run as fast as possible.
         stop: called between two steps, and while the pace waits; True ends the run.
         ready: called after the initialisation, before time and stamps begin.
         resume: called after a discarded step; returns start values with which the FMU is initialised
