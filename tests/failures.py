@@ -35,7 +35,7 @@ class Failure(NamedTuple):
 FAILURES = {
     "out of reach": Failure("arm", "task", {"x_des": (0.5, 0.1)}, ("reach",), "out of reach by 0.2099 m"),
     "a target in millimetres": Failure("arm", "task", {"x_des": (200.0, 50.0)}, ("reach",), "in millimetres?", 0.1),
-    "degrees": Failure("arm", "joint", {"q_des": (90.0, 0.35)}, ("degrees",), "q_des[1] = 90 rad: 90°?"),
+    "degrees": Failure("arm", "joint", {"q_des": (90.0, 0.35)}, ("degrees",), "did you mean 90°, which is 1.5708 rad?"),
     "degrees beyond the limits": Failure(
         "arm", "joint", {"q_des": (90.0, 0.35), "q_max": (1.0, 3.0)}, ("reach",), "is 1 rad; is it in degrees?"
     ),
@@ -268,7 +268,7 @@ FAILURES = {
         "joint",
         {"q_des": (-90.0, -1.2, 1.4, 0.2, -1.0, 0.3), "limit_effort": True, "payload": 40.0, "payload_known": True},
         ("degrees", "saturation"),
-        "-90°?",
+        "q_des[1] is -90 rad; did you mean -90°",
     ),
     "a load and a joint at its limit": Failure(
         "ur5",

@@ -222,7 +222,7 @@ def test_a_joint_without_limits_may_turn_further_than_once() -> None:
     unbounded = 1.7976931348623157e308
     free: dict[str, Any] = {"q_min": (-unbounded, -3.0), "q_max": (unbounded, 3.0)}
     assert not verdict("joint", q_des=(7.0, 0.8), **free).causes
-    assert "90°?" in verdict("joint", 20.0, q_des=(90.0, 0.8), **free).lines[0]
+    assert "did you mean 90°" in verdict("joint", 20.0, q_des=(90.0, 0.8), **free).lines[0]
 
 
 @pytest.mark.parametrize("robot", ["arm", "panda", "so100"])

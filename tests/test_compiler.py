@@ -82,6 +82,14 @@ def test_another_virtual_environment_takes_a_kept_library(kept, monkeypatch, pla
     assert compile_library({"a.c": b"1"}, platform, "Arm", units=["a.c"]) == first
 
 
+def test_without_zig_the_command_that_installs_it_is_printed(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(BuildError, match=r"for the browser: install the extra 'native': \S+ -m pip install "):
+        compiler.compile_web_module({}, [])
+    with pytest.raises(BuildError, match=r"for win64: .* only; install the extra 'native': \S+ -m pip install "):
+        compile_library({}, "win64", "Arm", units=[])
+
+
 def copied(command, folder, environment):
     """Copy the source in place of compiling it."""
     Path(command[-1]).write_bytes((folder / "a.c").read_bytes())

@@ -349,7 +349,7 @@ SADDLED = {"payload": 9.0, "payload_known": True, "limit_effort": True, "gravity
             "target out of reach by 0.2099 m; the nearest reachable point is (0.2942, 0.05883)",
         ),
         ("task", {"x_des": [200.0, 50.0]}, "in millimetres?"),
-        ("joint", {"q_des": [90.0, 0.35]}, "q_des[1] = 90 rad: 90°? 90° is 1.571 rad"),
+        ("joint", {"q_des": [90.0, 0.35]}, "q_des[1] is 90 rad; did you mean 90°, which is 1.5708 rad?"),
         ("joint", HELD, "the target 0.8 rad of joint 'joint2' is out of reach by 0.2 rad"),
         ("task", {"q_min": [0.2, -3.0]}, "joint 'joint1' is at its lower limit"),
         ("task", {"f_ext": [0.0, 3.0, 0.0]}, "not know f_ext = (0, 3, 0)"),
@@ -369,6 +369,16 @@ def test_the_verdict_names_the_cause(page, joint_page, control, settings, words)
     until(page, bool, lambda page: page.evaluate(SEEN))
     page.evaluate("arm.step(500)")
     until(page, lambda text: text.splitlines()[:1] and words in text.splitlines()[0], said)
+
+
+def test_an_arm_that_never_moved_is_named(joint_page) -> None:
+    for friction, expected in ((20.0, True), ([20.0, 0.0], False)):
+        joint_page.evaluate("() => { arm.play(false); arm.startAgain(true); arm.set('q_des', [0.9, 0.7]); }")
+        joint_page.evaluate("size => arm.set('friction', size)", friction)
+        until(joint_page, bool, lambda page: page.evaluate(SEEN))
+        joint_page.evaluate("arm.step(500)")
+        until(joint_page, lambda text: "' sticks: its friction of 20 N·m" in text, said)
+        assert ("no joint ever moved" in said(joint_page).splitlines()) == expected
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from twodof.bag.provenance import Provenance
 from twodof.errors import PlotError, TwoDofError
 from twodof.geometry.kinematics import quaternions
 from twodof.pages.replay import replay
+from twodof.plots import words
 from twodof.plots.figure import save
 from twodof.plots.linkage import load_linkage
 from twodof.plots.runs import drawing, plot
@@ -97,6 +98,21 @@ def test_a_single_joint_has_its_position_above_its_velocity(tmp_path):
     assert found.error is not None
     height = 0.4 * np.sin(recording.q[:, 0])
     np.testing.assert_allclose(only(found.error, "bag")[:, 1], np.abs(height - 0.2), rtol=1e-9, atol=1e-15)
+
+
+def test_rounding_errors_of_a_target_are_0_and_a_difference_has_a_unit(fmu_path, tmp_path):
+    bags: list[Path] = []
+    for target in ((-2.69e-16, 0.2), (1e-15, 0.2000001)):
+        bags.append(tmp_path / f"bag{len(bags)}")
+        twodof.simulate(
+            fmu_path,
+            twodof.Bag(bags[-1]),
+            stop_time=0.02,
+            settings={"x_des": target, "q_noise": 1e-12, "control_period": 0.01},
+        )
+    first, other = read_tracks(bags)
+    assert first.settings["x_des"] == "(0, 0.2) m" and first.settings["q_noise"] == "1e−12"
+    assert re.search(r"; RMS \S+ rad$", words.difference(first, other))
 
 
 def test_joints_that_slide_have_metres(tmp_path):

@@ -40,7 +40,9 @@ export class Verdict {
     const all = this.grouped([root, ...others]), rest = root.noted ? all : all.slice(1), runaway = root.kind === "unstable";
     /** @type {(noted: boolean, word: string) => string[]} */
     const named = (noted, word) => rest.filter((other) => other.noted === noted).map(({ text }) => `${word} ${text}`);
-    return [root.noted ? "not reached" : `not reached: ${all[0].text}`, ...named(false, "also"), ...(runaway ? [] : named(true, "note:"))].slice(0, 3);
+    const lines = [root.noted ? "not reached" : `not reached: ${all[0].text}`, ...named(false, "also"), ...(runaway ? [] : named(true, "note:"))];
+    const moved = this.began || this.picked().some((k) => this.session.at("v", k).some(Boolean));
+    return [...lines.slice(0, 3), ...(moved ? [] : ["no joint ever moved"])];
   }
 
   /** The worst cause of each kind with the joints of its others, and all causes without a joint. */
@@ -131,7 +133,7 @@ export class Verdict {
       const { prismatic } = joints[i], [low, high] = this.search.limits(i), meant = (value * Math.PI) / 180;
       const fits = meant >= low && meant <= high;
       const way = group === "q_start" ? value : value - session.value("q", 0, i); // that of a continuous joint may be short
-      const text = `${group}[${i + 1}] = ${short(value)} rad: ${short(value)}°? ${short(value)}° is ${short(meant)} rad`;
+      const is = `${group}[${i + 1}] is ${short(value)} rad`, text = `${is}; did you mean ${short(value)}°, which is ${String(Number(meant.toPrecision(5))).replace("-", "\u2212")} rad?`;
       return !prismatic && Math.min(Math.abs(value), Math.abs(way)) > 2 * Math.PI && fits ? [cause("degrees", text)] : [];
     }));
   }

@@ -23,6 +23,7 @@ from ..children import Child, confine_program
 from ..errors import BuildError
 from ..files import data_file, temporary_folder, write_file
 from ..notebook import busy
+from ..version import install
 
 LOG = logging.getLogger(__name__)
 Run = Callable[[Sequence[str], Path, Mapping[str, str]], None]
@@ -120,7 +121,7 @@ def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str]) -> by
         BuildError: there is no compiler for WebAssembly, or the compiler failed.
     """
     if not compiles_for_the_web():
-        raise BuildError("cannot compile for the browser: install the package 'ziglang' (the extra 'native')")
+        raise BuildError(f"cannot compile for the browser: {install('native')}")
     LOG.info("compiling for the browser")
     command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *units]
     return _compile(sources, command, "module.wasm", _run_confined)
@@ -174,10 +175,7 @@ def _compilers(platform: str) -> list[list[str]]:
     missing = f"this machine's own compiler builds for {there} only"
     if platform in here:
         missing = "this machine has no C compiler"
-    raise BuildError(
-        f"cannot compile for {platform}: {missing}; install the package 'ziglang'"
-        " (the extra 'native'), which compiles for every platform"
-    )
+    raise BuildError(f"cannot compile for {platform}: {missing}; {install('native')}")
 
 
 def _link_flags(output: str) -> list[str]:

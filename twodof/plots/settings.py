@@ -10,6 +10,7 @@ WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "r
 """FMI units in the spelling of figures."""
 UNITS = {group: WRITTEN.get(unit, unit) for group, _, _, unit, *_ in ROWS if unit and "|" not in unit}
 """Units of variables that do not depend on the joint."""
+ROUNDING = 1e-14  # an element that is smaller relative to the largest one is 0
 
 
 def settings_of(bag: Recording) -> dict[str, str]:
@@ -36,7 +37,8 @@ def _group(name: str) -> str:
 
 def _text(values: Sequence[float | bool]) -> str:
     """Return one value if all are equal, as gains often are, else all values."""
-    texts = [str(v).lower() if isinstance(v, bool) else number(v) for v in values]
+    least = ROUNDING * max((abs(v) for v in values if abs(v) < UNBOUNDED), default=0.0)
+    texts = [str(v).lower() if isinstance(v, bool) else number(v if abs(v) > least else 0.0) for v in values]
     return texts[0] if len(set(texts)) == 1 else f"({', '.join(texts)})"
 
 

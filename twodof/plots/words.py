@@ -92,9 +92,9 @@ def difference(first: Track, other: Track) -> str:
     if not found:
         return ""
     joint, off = max(found, key=lambda each: float(each[1].max()))
-    size = f"{off.max():.3g} {joint.unit}".strip()
+    size, rms = (f"{value:.3g} {joint.unit}".strip() for value in (off.max(), np.sqrt(np.mean(off**2))))
     where = f"{joint.name} at {number(t[off.argmax()])} s"
-    return f"at most {size} from '{first.name}', {where}; RMS {np.sqrt(np.mean(off**2)):.3g}"
+    return f"at most {size} from '{first.name}', {where}; RMS {rms}"
 
 
 def summary(track: Track, first: Track | None = None) -> dict[str, str]:

@@ -158,7 +158,8 @@ def _degrees(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             fits = setup.low[i] - AT_LIMIT <= radians(value) <= setup.high[i] + AT_LIMIT
             way = value if group == "q_start" else value - judge.first[i]  # that of a continuous joint may be short
             if setup.units[i] == "rad" and min(abs(value), abs(way)) > least and fits:
-                text = f"{group}[{i + 1}] = {value:g} rad: {value:g}°? {value:g}° is {radians(value):.4g} rad"
+                meant = f"did you mean {value:g}°, which is {radians(value):.5g} rad?"
+                text = f"{group}[{i + 1}] is {value:g} rad; {meant}"
                 yield Cause("degrees", text, 1.0, joint)
 
 
