@@ -117,7 +117,7 @@ def test_its_bag_and_the_printed_facts(oscillators, tmp_path, capsys):
     assert re.search(r"FMU .*fmu \(Oscillators\)\n", said) and re.search(r"FMI +3\.0\n", said)
     assert re.search(r"w2\[2\] +4, 9 +parameter\n", said)
     for refused, reason in (
-        (["page", str(oscillators), "-o", str(tmp_path / "a.html")], "has no plant in C"),
+        (["page", str(oscillators), "-o", str(tmp_path / "a.html")], "is not a native FMU of twodof"),
         (["linearise", str(oscillators)], "has no directional derivatives"),
         (["live", str(oscillators), "--no-browser"], "contains no robot"),
     ):

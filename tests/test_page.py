@@ -756,7 +756,7 @@ def test_a_module_of_the_page_exports_what_others_import(module) -> None:
 
 
 def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:
-    with pytest.raises(PageError, match="has no plant in C"):
+    with pytest.raises(PageError, match="is not a native FMU of twodof"):
         twodof.page(fmu_path, tmp_path / "x.html")
     assert not (tmp_path / "x.html").exists()
 

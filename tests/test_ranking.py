@@ -227,9 +227,9 @@ def test_a_cost_that_no_run_has_ranks_none(cost, native_path, tmp_path, capsys):
     [
         ("setling", "did you mean settling_time?"),
         ("settling > 1", "is not a value, as 'settling + 0.1*peak_effort'"),
-        ("peak", "there is not a number 'peak'; did you mean peak_effort or peak_velocity?"),
+        ("peak", "there is no metric 'peak'; did you mean peak_effort or peak_velocity?"),
         ("__import__('os')", "is not a value"),
-        ("1/0", "'1/0' has no number of a run; there are: settling_time, overshoot, "),
+        ("1/0", "'1/0' names no metric; there are: settling_time, overshoot, "),
     ],
 )
 def test_a_cost_is_refused_before_the_sweep(cost, said, native_path, tmp_path, capsys):

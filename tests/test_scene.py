@@ -481,7 +481,7 @@ def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path, caplog):
     }
     urdf = with_mesh().replace("thing.stl", "thing.gltf")
     description = Scene(urdf, [], "thing", lambda _: json.dumps(content).encode()).description
-    assert "its format '.gltf' is none of .stl" in caplog.text
+    assert "its format '.gltf' is not one of .stl" in caplog.text
     assert geometries(description) == []
 
 

@@ -185,7 +185,7 @@ def test_a_name_without_an_index_sets_all_elements(native_path):
         (["--grid", "Kp=1:2:3", "--set", "Kp[1]=4"], "Kp[1] gets values from the settings and from Kp"),
         (["--range", "Kp=1:2"], "0 random draws of Kp; give at least 1 with --random"),
         (["--range", "Kp=2:1", "--random", "3"], "LOW 2 must be below HIGH 1"),
-        (["--grid", "Kp=1:2:3", "--random", "3"], "3 random draws of nothing; give a range"),
+        (["--grid", "Kp=1:2:3", "--random", "3"], "--random 3 needs a range"),
         ([], "there is nothing to vary"),
         (["--grid", "Kp=1:2:3", "--stop-time", "-1"], "stop time -1 s must be after"),
         (["--grid", "Kp=1:2:99999", "--grid", "Kd=1:2:99"], "runs; at most"),

@@ -132,7 +132,7 @@ def test_another_sweep_is_not_resumed(native_path, tmp_path, fmu_path):
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     for change, said in (
         ({"grid": {"Kp": [1.0, 3.0]}}, r'was begun with grids {"Kp": \[1.0, 2.0\]};'),
-        ({"stop_time": 0.06}, "was begun with stop time 0.05; begin this sweep in another `output`"),
+        ({"stop_time": 0.06}, "was begun with stop time 0.05; give another `output`"),
         ({"bags": True}, "was begun with `bags=False`;"),
         ({"resume": False}, "exists; resume it with `resume=True`, or choose another `output`"),
     ):

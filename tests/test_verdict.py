@@ -450,7 +450,7 @@ def test_a_condition_fails_a_run(
 @pytest.mark.parametrize(
     ("condition", "reason"),
     [
-        ("eror > 1", "there is not a number 'eror'; did you mean"),
+        ("eror > 1", "there is no metric 'eror'; did you mean"),
         ("error", "is not a comparison"),
         ("__import__('os').system('true') > 0", "is not a comparison"),
         ("error.__class__ > 0", "is not a comparison"),

@@ -121,7 +121,7 @@ class Meshes:
         if content is None:
             return []
         if suffix not in MESH_FORMATS:
-            raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
+            raise ValueError(f"its format '{suffix}' is not one of {', '.join(MESH_FORMATS)}")
         if coloured and suffix in COLOURED and all(map(find_spec, ("trimesh", "collada"))):
             try:
                 return self._parsed(COLOURS, suffix, content, self._read(f"{name}.mtl"))

@@ -107,7 +107,7 @@ def page_of(run: Experiment) -> bytes:
     """Return the HTML of a run's FMU; errors as in ``page``."""
     fmu, sources = run.fmu, _sources(run.fmu)
     if not fmu.control or not sources:
-        raise PageError(f"'{fmu.path}' has no plant in C, as native FMUs of this package have; build one with `native`")
+        raise PageError(f"'{fmu.path}' is not a native FMU of twodof; build one with `native`")
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
     try:

@@ -119,7 +119,7 @@ class Listener:
                 command = self._follows.read(kind, cdr)
                 late = (sample.stamp - command.stamp) / NANOSECONDS
                 if kind == JOINT_STATE and self._oldest and command.stamp and late > self._oldest:
-                    raise CommandError("stamp", f"is stamped {late:.3g} s before the sample that it is for")
+                    raise CommandError("stamp", f"has a stamp {late:.3g} s older than its sample")
                 return command
 
             for command, writer in self._come(name, read, WHAT[kind]):

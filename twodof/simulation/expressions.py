@@ -69,17 +69,17 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
     except (ValueError, SyntaxError, OverflowError, RecursionError, MemoryError):
         like = "a comparison, as 'error > 1e-3'" if condition else "a value, as 'settling + 0.1*peak_effort'"
         if re.search(r"\b(and|or)\b|,|&", text):
-            remedy = "; give each condition for itself" if condition else ""
+            remedy = "; give each condition separately" if condition else ""
         else:
             remedy = "; leave units out" if re.search(r"\d\s*(%|(?!e[-+]?\d)[^\W\d])", text) else ""
         raise InputError(f"'{text:.100}' is not {like}{remedy}") from None
     if not names:
-        raise InputError(f"'{text:.100}' has no number of a run; there are: {', '.join(known)}")
+        raise InputError(f"'{text:.100}' names no metric; there are: {', '.join(known)}")
     for name in names:
         if not full_name(name, known):
             near = " or ".join(each for each in known if each.startswith(name)) or nearest(name, known, 0.4)
             hint = f"did you mean {near}?" if near else f"there are: {', '.join(known)}"
-            raise InputError(f"'{text:.100}': there is not a number '{name:.50}'; {hint}")
+            raise InputError(f"'{text:.100}': there is no metric '{name:.50}'; {hint}")
     full = {name: full_name(name, known) for name in names}
 
     def evaluate(values: Values) -> Numbers:

@@ -62,7 +62,7 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
         raise InputError(f"'{path}' has no column 'time'; {_header_remedy(names)}")
     elements = {name: _inputs(fmu, path, name) for name in header if name != "time"}
     if not elements:
-        raise InputError(f"'{path}' has no column beside 'time'; add one for each input")
+        raise InputError(f"'{path}' has no column except 'time'; add one for each input")
     for name, own in elements.items():
         if len(own) > 1:
             LOG.info(f"'{path}': the column '{name}' sets all {len(own)} elements")
@@ -117,9 +117,9 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
         raise InputError(f"'{path}': {no_variable(fmu, name, 'input')}")
     variables = [fmu.variables[element] for element in elements]
     if variables[0].causality == "parameter":
-        raise InputError(f"'{path}': {name} is a parameter, which is set before a run and not by a table")
+        raise InputError(f"'{path}': {name} is a parameter, which cannot change during a run; give it as a setting")
     if any(variable.causality != "input" or variable.type not in KINDS for variable in variables):
-        raise InputError(f"'{path}': {name} is not an input of a number or Boolean")
+        raise InputError(f"'{path}': {name} is not an input that is a number or a Boolean")
     return elements
 
 

@@ -26,7 +26,7 @@ FOLLOWED = 0.1  # fraction of the target's travel: with a larger RMS error in th
 
 
 class Metric(NamedTuple):
-    """One number of a run, and column of a sweep's table.
+    """Metric of a run, a column of a sweep's table.
 
     Attributes:
         title: title in tables and figures.

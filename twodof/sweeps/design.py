@@ -81,7 +81,7 @@ def make_design(
     if limits and random < 1:
         raise InputError(f"{random} random draws of {', '.join(limits)}; give at least 1 with `random`")
     if random and not limits:
-        raise InputError(f"{random} random draws of nothing; give a range")
+        raise InputError(f"`random` {random} needs a range")
     if seed < 0:
         raise InputError(f"the seed {seed} is negative")
     design = Design(grids, limits, max(1, random), seed)

@@ -192,7 +192,7 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
                 differing = {name: value for name, value in there[key].items() if value != wanted[key].get(name)}
                 texts = (f"{name.replace('_', ' ')} {json.dumps(value):.200}" for name, value in differing.items())
                 other = ", ".join(texts)
-            remedy = "begin this sweep in another `output`, or resume that one as it was begun"
+            remedy = "give another `output`, or the options of the first run"
             raise SweepError(f"'{path}' was begun with {other}; {remedy}")
     if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
         raise SweepError(f"'{path}' was begun by twodof {there['versions']['twodof']}; continue with that version")
