@@ -287,6 +287,22 @@ def test_robots_of_a_bag_that_are_read_together_are_limited(bag, command, capsys
     assert capsys.readouterr().err == f"twodof: error: the bag '{bag}' is of 33 robots, more than 32 at a time; {one}\n"
 
 
+@pytest.mark.parametrize("command", [["info"], ["plot", "-o", "x.png"]])
+def test_the_provenances_of_all_robots_are_limited_together(bag, tmp_path, monkeypatch, capsys, command):
+    topics = b"".join(channel(i, f"/{robot}/joint_states") for i, robot in enumerate(("left", "right")))
+    data = [message(joint_state(2, START + t), number=i) for t in range(9) for i in range(2)]
+    (bag / "bag.mcap").write_bytes(HEADER + SCHEMA + topics + b"".join(data) + FOOTER)
+    for robot in ("left", "right"):
+        (bag / f"run.{robot}.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", 4)
+    assert main([*command, str(bag)]) == 0
+    monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", 3)
+    assert main([*command, str(bag)]) == 1
+    assert f"MiB together; give one, such as '{bag}:left'" in capsys.readouterr().err
+    assert main([*command, f"{bag}:left"]) == 0
+
+
 @pytest.mark.parametrize(("command", "passes"), [(["info"], 2), (["info", "--json"], 2), (["plot", "-o", "x.png"], 1)])
 def test_a_bag_of_several_robots_is_read_once(bag, command, passes, monkeypatch, tmp_path, capsys):
     """``info`` reads the samples again, for the verdicts."""

@@ -221,10 +221,14 @@ def robot_in(path: Path) -> tuple[Path, str]:
 def each_robot(path: Path) -> list[Path]:
     """Return the addresses of a bag's robots, as ``robot_in`` accepts them."""
     robots = robots_of(path) if path.is_dir() else [""]
+    if len(robots) == 1:
+        return [path]
+    one = f"give one, such as '{path}:{robots[0]}'"
     if len(robots) > MAX_ROBOTS:
-        one = f"give one, such as '{path}:{robots[0]}'"
         raise BagError(f"the bag '{path}' is of {len(robots)} robots, more than {MAX_ROBOTS} at a time; {one}")
-    return [path] if len(robots) == 1 else [Path(f"{path}:{robot}") for robot in robots]
+    if sum((path / file_of(robot)).stat().st_size for robot in robots) > MAX_PROVENANCE:
+        raise BagError(f"the run.*.json files of '{path}' have more than {MAX_PROVENANCE // MIB} MiB together; {one}")
+    return [Path(f"{path}:{robot}") for robot in robots]
 
 
 def _as_json(content: object) -> bytes:
