@@ -51,6 +51,8 @@ MISTAKES: dict[str, str] = {
     "show bag": "'show'; did you mean 'info'",
     "": "there is no verb; begin with 'twodof build', or see 'twodof --help'",
     "build --robot": "argument --robot: expected one argument: NAME, .*--list-robots",
+    "build --robot UR5": "no robot 'UR5'; did you mean 'ur5_robot'",
+    "export bag": "an export needs the name of its file, as in -o bag.csv",
     "build --frame": "expected one argument: FRAME, controlled link",
     "xyzzy": "no verb 'xyzzy'; there are: build, run, ",
     "help simulate": "'simulate'; did you mean 'run'",

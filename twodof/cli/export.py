@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from ..errors import InputError
 from .help import Parser
 from .options import not_empty
 from .printing import print_table, written
@@ -15,12 +16,14 @@ def add(export: Parser) -> None:
     )
     export.add_argument("bags", metavar="BAG", type=Path, nargs="+", help="folder of the bag; several for .lerobot")
     text = "output: .csv or .mcap; with the extra 'sweep' also .parquet, or a folder .lerobot"
-    export.add_argument("-o", dest="output", required=True, type=not_empty, metavar="FILE", help=text)
+    export.add_argument("-o", dest="output", type=not_empty, metavar="FILE", help=text)
 
 
 def call(options: argparse.Namespace) -> int:
     from ..bag.exports import export_bag
 
+    if options.output is None:
+        raise InputError(f"an export needs the name of its file, as in -o {options.bags[0].name}.csv")
     path = export_bag(options.bags, options.output)
     print_table(("bag", ", ".join(map(str, options.bags))), ("file", written(path)))
     return 0

@@ -59,7 +59,7 @@ def stock_robot(name: str, lock: Mapping[str, float] | None = None) -> FmuOption
     """
     known = stock_robots()
     if name not in known:
-        begun = [each for each in known if each.startswith(name)]  # ur5_robot for ur5, which resembles ur3
+        begun = [each for each in known if each.lower().startswith(name.lower())]  # ur5_… of ur5
         remedy = choice(name, begun, 0.0) if begun else choice(name, known) if known else f"; {SOURCE}"
         raise BuildError(f"there is no robot '{name}'{remedy}")
     path = known[name]
