@@ -316,11 +316,14 @@ def test_friction_and_stops_do_not_depend_on_the_communication_step(rigid):
 
 
 def test_rigid_stops_at_default_tolerances_do_not_depend_on_the_communication_step(length):
-    """Impacts drive joints off their stops, to which some return within microseconds and leave again."""
+    """Impacts drive joints off their stops, to which some return within microseconds and leave again.
+
+    In the last motion, a hold of all joints at limits follows one that bounds it.
+    """
     urdf = chain(np.random.default_rng(2), 4)
     for control in ("joint", "effort"):
         native = Engine(from_urdf(urdf, "link4", "xyz", control))
-        for seed in range(length(3000, 300)):
+        for seed in sorted({*range(length(3000, 300)), 345}):
             plant, ends = thrown(native.model, np.random.default_rng(seed)), []
             for h in (1e-3, 5e-2):
                 *_, (q, _) = states(native, plant, h, round(0.1 / h), python=False)

@@ -413,7 +413,7 @@ def test_a_release_that_ends_between_two_looks_at_the_effort_is_found_by_both_fl
 @pytest.mark.parametrize("name", ["tiago", "tiago_dual"])
 def test_many_joints_at_stops_need_few_evaluations(name, friction, monkeypatch):
     """Bare robots with hands fall onto rigid stops; a step needs at least 60 evaluations."""
-    monkeypatch.setattr(regime, "BUDGET", 560)
+    monkeypatch.setattr(regime, "BUDGET", 390)
     plant = bare(name, friction)
     for _ in range(30):
         plant.step(STEP)

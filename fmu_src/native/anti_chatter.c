@@ -19,7 +19,7 @@ typedef struct {
     double risen, risen_v[N_JOINTS];          /* time of the rank's last rise, and velocities at that time */
     Hold joints, rank, stuck[N_JOINTS];
     int chattering[N_JOINTS], joints_held[N_JOINTS];
-    double soon, longest;                     /* arguments of hold_for_a_while for the next hold of joints */
+    double soon, bound[N_JOINTS];             /* argument of hold_for_a_while, and each joint's longest hold */
 } AntiChatter;
 
 static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
@@ -33,6 +33,7 @@ static void begin_anti_chatter(AntiChatter *chatter, const Plant *plant)
     chatter->joints = chatter->rank = none;
     for (int i = 0; i < N_JOINTS; i++) {
         chatter->left[i] = chatter->slipped[i] = -HUGE_VAL;
+        chatter->bound[i] = HUGE_VAL;
         chatter->stuck[i] = none;
     }
 }
@@ -59,6 +60,18 @@ static int is_at_limit(const Step *step, int i)
     return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
 }
 
+/* The longest hold of joints at limits at t, within the bounds of those that returned in the present sequence of holds. */
+static double longest_hold(AntiChatter *chatter, const Step *step, double t)
+{
+    double longest = chatter->chatter_time;
+    for (int i = 0; i < N_JOINTS; i++) {
+        if (!chatter->chattering[i] && !(t - chatter->joints.until < chatter->soon))
+            chatter->bound[i] = HUGE_VAL;
+        longest = is_at_limit(step, i) ? fmin(longest, chatter->bound[i]) : longest;
+    }
+    return longest;
+}
+
 /* Hold the joints that chatter at t, and set `kept` for all joints that are held. A repeated hold of HOLD_OF_ALL
    or longer covers all joints at limits. Return the time at which the first hold ends, at most h. */
 static double hold_joints(AntiChatter *chatter, const Step *step, double t, double h, int kept[N_JOINTS])
@@ -67,10 +80,11 @@ static double hold_joints(AntiChatter *chatter, const Step *step, double t, doub
     int any = 0;
     for (int i = 0; i < N_JOINTS; i++)
         any |= chatter->chattering[i];
+    const double longest = any ? longest_hold(chatter, step, t) : 0.0;
     if (any)
-        hold_for_a_while(&chatter->joints, t, chatter->soon, chatter->longest, chatter->first);
+        hold_for_a_while(&chatter->joints, t, chatter->soon, longest, chatter->first);
     const double length = chatter->joints.length;
-    const int all = any && length >= HOLD_OF_ALL * chatter->chatter_time && length > chatter->first * chatter->longest;
+    const int all = any && length >= HOLD_OF_ALL * chatter->chatter_time && length > chatter->first * longest;
     for (int i = 0; i < N_JOINTS && (any || !(chatter->joints.until > t)); i++)
         chatter->joints_held[i] = all ? is_at_limit(step, i) : chatter->chattering[i];
     if (chatter->joints.until > t)
@@ -93,7 +107,6 @@ static void find_departures(AntiChatter *chatter, const Step *step, double t)
         chatter->chattering[i] = 0;
     }
     chatter->soon = chatter->rigid ? chatter->chatter_time : HOLD_GROWTH * chatter->joints.length;
-    chatter->longest = chatter->chatter_time;
 }
 
 /* Record a rise of the rank at t. If the rank drops at t, and the effect of the higher rank since its rise is within
@@ -130,7 +143,7 @@ static void find_chatter(AntiChatter *chatter, const Step *step, const Event *ev
             hold = bounded(hold, step, i, error, passed);
         chatter->chattering[i] = event->stopped[i] && passed < (chatter->rigid ? chatter->chatter_time : hold);
         if (chatter->chattering[i]) {
-            chatter->longest = fmin(chatter->longest, hold);
+            chatter->bound[i] = hold;
             if (!(passed < FIRST_HOLD * chatter->chatter_time)) /* rounding ends a shorter excursion */
                 chatter->soon = fmax(chatter->soon, hold);
         }

@@ -17,6 +17,7 @@ typedef struct {
     const double (*P)[4];                  /* weights of K in the dense output */
     double K[STAGES + 1][N_STATES];
     double effort[STAGES + 1][N_JOINTS];   /* the efforts that hold joints at rest */
+    double effort_rate[N_JOINTS];          /* rates of the holding efforts at the end of the last regime, per s */
     double rounding;                       /* bound on the rounding error of the holding efforts */
     long evaluations;                      /* evaluations of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */

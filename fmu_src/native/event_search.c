@@ -1,130 +1,21 @@
 /* Find the first event within an integration step, on its dense output. The rules and their derivation are in
    plant/event_search.py. */
 #include <math.h>
-#include <stddef.h>
 #include <string.h>
 
 /* Bounds for Dormand and Prince's interpolant; the cubic has smaller ones, 1.07 and 2. */
 static const double REACH = 1.66, PACE = 3.72;
-enum { LOOKS = 4 };
-static const double DOUBT = 0.25;
-enum { HALVINGS = 7 };
-static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
-static const double RELEASE_RESOLUTION = 1.0 / 1024.0, FINEST_RELEASE = 1.0 / 67108864.0; /* 2⁻¹⁰, 2⁻²⁶ */
+enum { HALVINGS = 7, LOOKS = 10 }; /* the latter: at most, of a joint */
+static const double DOUBT = 0.25, LATE = 1.0 / 256.0;
 static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
+/* Weights of the efforts at the start, at both thirds and at the end of a stiff step. */
+static const double THROUGH_THIRDS[N_INCREMENTS + 1][4] = {
+    {1, -2.75, 3, -1.125}, {0, 4.5, -7.5, 3.375}, {0, -2.25, 6, -3.375}, {0, 0, 0, 0}, {0, 0.5, -1.5, 1.125}};
 
 /* The event at the end of a step: joints that reached a limit, and joints that slipped and came to rest. */
 typedef struct {
     int stopped[N_JOINTS], arrested[N_JOINTS];
 } Event;
-
-/* A margin at a time within the step, negative after the end of the regime. Some margins have one value for each
-   component of the state. */
-typedef double Margin(Step *step, double passed, int component);
-
-static void interpolated(const Step *step, double passed, double y[N_STATES])
-{
-    for (int i = 0; i < N_STATES; i++)
-        y[i] = dense_output(step, passed, i);
-}
-
-/* Distance to the nearer limit. */
-static double limit_margin(Step *step, double passed, int joint)
-{
-    const double q = dense_output(step, passed, joint);
-    const double *value = step->plant->value;
-    return fmin(value[Q_MAX + joint] - q, q - value[Q_MIN + joint]);
-}
-
-/* Velocity in the direction of slip. */
-static double slip_margin(Step *step, double passed, int component)
-{
-    return step->stops.slip[component - N_JOINTS] * dense_output(step, passed, component);
-}
-
-/* Efforts that hold joints at rest. */
-static void find_efforts(Step *step, double passed, double effort[N_JOINTS])
-{
-    double y[N_STATES], a[N_JOINTS];
-    interpolated(step, passed, y);
-    evaluate(step, y, a, effort, NULL);
-}
-
-/* Distance of a joint's holding effort from its bound on one side, beyond rounding: a released joint moves. */
-static double grip_of(const Step *step, int i, double effort, int side)
-{
-    return grip(step->plant, &step->stops, i, step->y[i], effort, side) + step->rounding;
-}
-
-static double least_grip(const Step *step, const double effort[N_JOINTS])
-{
-    double least = HUGE_VAL;
-    for (int i = 0; i < N_JOINTS; i++)
-        if (step->stops.watched[i])
-            least = fmin(least, fmin(grip_of(step, i, effort[i], -1), grip_of(step, i, effort[i], 1)));
-    return least;
-}
-
-static double release_margin(Step *step, double passed, int component)
-{
-    double effort[N_JOINTS];
-    (void)component;
-    find_efforts(step, passed, effort);
-    return least_grip(step, effort);
-}
-
-/* The margin of the rank; for a held rank, the margin to a lower rank only. */
-static double singular_margin(Step *step, double passed, int rank_held)
-{
-#ifdef HAS_RCOND
-    const double rcond = step->plant->value[RCOND];
-    const int rank = step->stops.rank;
-    double y[N_STATES], ratio[N_ROWS];
-    interpolated(step, passed, y);
-    conditioning(y, ratio);
-    step->evaluations++;
-    if (rank_held)
-        return rank > 0 ? ratio[rank - 1] - rcond : 1.0;
-    return rank_margin(ratio, rcond, rank);
-#else
-    (void)step, (void)passed, (void)rank_held;
-    return 1.0;
-#endif
-}
-
-/* First time in (a, b] at which a margin is negative, to the last bits of the step; it is negative at b. The
-   interpolation stays near the middle, so that it never needs many more evaluations than bisection.
-   Source: Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020. */
-static double locate(Step *step, Margin *margin, int joint, double a, double at_a, double b,
-                     double at_b)
-{
-    const double released = fmax(RELEASE_RESOLUTION * coarseness(step->plant), FINEST_RELEASE);
-    const double resolution = (margin == release_margin ? released : TIME_RESOLUTION) * step->size;
-    const double k = 0.01 / (b - a); /* small, because margins are smooth */
-    double slack = b - a; /* how much longer the interval may be than after bisection */
-    while (b - a > resolution) {
-        const double middle = 0.5 * (a + b), half = 0.5 * (b - a);
-        double x = at_a > at_b ? (b * at_a - a * at_b) / (at_a - at_b) : middle;
-        const double shift = fmin(k * (b - a) * (b - a), fabs(middle - x));
-        x += middle > x ? shift : -shift;
-        if (fabs(x - middle) > slack - half)
-            x = middle + (x > middle ? slack - half : half - slack);
-        if (!(a < x && x < b))
-            x = middle;
-        if (!(a < x && x < b)) /* a and b are neighbouring numbers */
-            break;
-        const double at_x = margin(step, x, joint);
-        if (at_x < 0.0) {
-            b = x;
-            at_b = at_x;
-        } else {
-            a = x;
-            at_a = at_x;
-        }
-        slack = fmax(0.5 * slack, resolution);
-    }
-    return b;
-}
 
 /* First time in (a, b] at which a margin is negative, or HUGE_VAL. Its values at the ends and its largest rate of
    change exclude intervals. */
@@ -168,8 +59,8 @@ static double first_crossing(Step *step, Margin *margin, int component, double d
     return HUGE_VAL;
 }
 
-/* True if the holding effort of a joint may exceed its bound on one side within the step. */
-static int may_pass(const Step *step, int joint, int side)
+/* Range of the grip of a joint on one side over the stages if it may be negative within the step; otherwise 0. */
+static double doubtful_range(const Step *step, int joint, int side)
 {
     double low = HUGE_VAL, high = -HUGE_VAL;
     for (int stage = 0; stage <= step->stages; stage++) {
@@ -177,88 +68,83 @@ static int may_pass(const Step *step, int joint, int side)
         low = fmin(low, margin);
         high = fmax(high, margin);
     }
-    return low < HUGE_VAL && !(low >= high - low);
+    return low < HUGE_VAL && !(low >= high - low) ? high - low : 0.0;
 }
 
 static int may_be_released(const Step *step, int joint)
 {
-    return may_pass(step, joint, -1) || may_pass(step, joint, 1);
+    return doubtful_range(step, joint, -1) != 0.0 || doubtful_range(step, joint, 1) != 0.0;
 }
 
-/* The polynomial through five equidistant values from 0 to 1. */
-static void fit(const double p[LOOKS + 1], double c[LOOKS + 1])
+/* The holding effort of a joint, multiplied by a factor, as a polynomial over the step: the rate of the dense output of
+   its integral. */
+static void effort_polynomial(const Step *step, const double weight[][4], int joint, double factor, double c[4])
 {
-    const double first = p[1] - p[0], second = p[2] - 2.0 * p[1] + p[0];
-    const double third = p[3] - 3.0 * p[2] + 3.0 * p[1] - p[0];
-    const double fourth = p[4] - 4.0 * p[3] + 6.0 * p[2] - 4.0 * p[1] + p[0];
-    c[0] = p[0]; /* Newton's form, multiplied out */
-    c[1] = 4.0 * (first - second / 2.0 + third / 3.0 - fourth / 4.0);
-    c[2] = 16.0 * (second / 2.0 - third / 2.0 + fourth * 11.0 / 24.0);
-    c[3] = 64.0 * (third / 6.0 - fourth / 4.0);
-    c[4] = 256.0 * (fourth / 24.0);
-}
-
-/* Find minima, possibly below zero, of the polynomial through sampled values of a margin; return their number. */
-static int doubtful_minima(const double p[LOOKS + 1], double x[LOOKS])
-{
-    double c[LOOKS + 1], slope[LOOKS], low = p[0], high = p[0];
-    int count = 0;
-    fit(p, c);
-    for (int k = 1; k <= LOOKS; k++) {
-        slope[k - 1] = k * c[k];
-        low = fmin(low, p[k]);
-        high = fmax(high, p[k]);
+    for (int k = 0; k < 4; k++) {
+        c[k] = 0.0;
+        for (int s = 0; s <= step->stages; s++)
+            c[k] += factor * (k + 1) * weight[s][k] * step->effort[s][joint];
     }
-    const int turns = sign_changes(slope, LOOKS - 1, x);
-    for (int k = 0; k < turns; k++)
-        if (polynomial(c, LOOKS, x[k]) < DOUBT * (high - low))
-            x[count++] = x[k];
-    return count;
+}
+
+/* Times just after the grips of a joint, as polynomials over the step, pass 0, and times of extrema that may be below 0;
+   return their number. */
+static int find_looks(const Step *step, const double weight[][4], int joint, double look[LOOKS])
+{
+    int looks = 0;
+    for (int side = -1; side <= 1; side += 2) {
+        const double range = doubtful_range(step, joint, side);
+        double c[4], root[3], turn[2];
+        if (range == 0.0)
+            continue;
+        effort_polynomial(step, weight, joint, -side, c);
+        c[0] = grip_of(step, joint, step->effort[0][joint], side);
+        const double slope[3] = {c[1], 2.0 * c[2], 3.0 * c[3]};
+        const int roots = sign_changes(c, 3, root), turns = sign_changes(slope, 2, turn);
+        for (int k = 0; k < roots; k++) /* where rounding does not decide the sign */
+            look[looks++] = root[k] * step->size + LATE * release_resolution(step);
+        for (int k = 0; k < turns; k++)
+            if (polynomial(c, 3, turn[k]) < DOUBT * range)
+                look[looks++] = turn[k] * step->size;
+    }
+    return looks;
 }
 
 /* First time before `before` at which a joint is released, or HUGE_VAL. */
 static double first_release(Step *step, double before)
 {
-    double effort[LOOKS + 1][N_JOINTS], look[2 * LOOKS * N_JOINTS];
+    const double instant = TIME_RESOLUTION * step->size, end = fmin(before, step->size);
+    const double at_start = least_grip(step, step->effort[0]);
+    const double (*weight)[4] = step->P;
+    double look[LOOKS * N_JOINTS], a = 0.0, at_a = at_start;
     int looks = 0, doubt = 0;
     for (int i = 0; i < N_JOINTS; i++)
         doubt |= step->stops.watched[i] && may_be_released(step, i);
-    if (!doubt)
+    if (!doubt || before <= instant)
         return HUGE_VAL;
-    const double instant = TIME_RESOLUTION * step->size;
-    if (before <= instant)
-        return HUGE_VAL;
-    const double at_start = least_grip(step, step->effort[0]);
     const double at_once = at_start > 4.0 * step->rounding ? at_start : release_margin(step, instant, 0);
     if (at_once < 0.0 && at_once < -fabs(release_margin(step, 0.0, 0) - at_start))
         return instant; /* beyond the difference of two ways to compute the efforts; else the joint would be held again */
-    memcpy(effort[0], step->effort[0], sizeof *effort);
-    memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
-    for (int k = 1; k < LOOKS; k++)
-        find_efforts(step, step->size * k / LOOKS, effort[k]);
+    if (step->P == CUBIC) { /* its derivatives are not those at the stages */
+        weight = THROUGH_THIRDS;
+        for (int k = 1; k < 3; k++)
+            find_efforts(step, step->size * k / 3, step->effort[k]);
+    }
     for (int i = 0; i < N_JOINTS; i++)
-        for (int side = -1; side <= 1; side += 2) {
-            double p[LOOKS + 1];
-            for (int k = 0; k <= LOOKS; k++)
-                p[k] = grip_of(step, i, effort[k][i], side);
-            if (step->stops.watched[i] && may_pass(step, i, side))
-                looks += doubtful_minima(p, look + looks);
-        }
-    for (int k = 1; k <= LOOKS && step->size * (k - 1) / LOOKS < before; k++) {
-        const double a = step->size * (k - 1) / LOOKS, at_a = least_grip(step, effort[k - 1]);
-        double b = step->size * k / LOOKS, at_b = least_grip(step, effort[k]);
-        for (int j = 0; j < looks; j++) {
-            const double passed = look[j] * step->size;
-            const double at_look = a < passed && passed < b ? release_margin(step, passed, 0) : 0.0;
-            if (at_look < 0.0) {
-                b = passed;
-                at_b = at_look;
-            }
-        }
+        if (step->stops.watched[i])
+            looks += find_looks(step, weight, i, look + looks);
+    for (;;) {
+        double b = end;
+        for (int j = 0; j < looks; j++)
+            b = a < look[j] && look[j] < b ? look[j] : b;
+        const double at_b = b < step->size ? release_margin(step, b, 0) : least_grip(step, step->effort[step->stages]);
         if (at_b < 0.0)
             return locate(step, release_margin, 0, a, at_a, b, at_b);
+        if (b == end)
+            return HUGE_VAL;
+        a = b;
+        at_a = at_b;
     }
-    return HUGE_VAL;
 }
 
 /* True if the velocity of a joint that slips may pass zero within the step. */
@@ -303,6 +189,19 @@ static void name_event(Step *step, double passed, const double y[N_STATES], Even
     }
 }
 
+/* Find the rates of the holding efforts at a time within the step; 0 in a stiff one. */
+static void find_effort_rates(Step *step, double passed)
+{
+    const double x = passed / step->size;
+    double c[4] = {0.0};
+    for (int i = 0; i < N_JOINTS; i++) {
+        const int known = step->stops.watched[i] && step->P != CUBIC;
+        if (known)
+            effort_polynomial(step, step->P, i, 1.0 / step->size, c);
+        step->effort_rate[i] = known ? c[1] + x * (2.0 * c[2] + 3.0 * c[3] * x) : 0.0;
+    }
+}
+
 /* First time in (0, size] at which the regime of the step ends; y_new becomes the state there. 0 if it does not end.
    With rank_held, only a drop of the rank of J⁺ counts. */
 static double first_event(Step *step, int rank_held, Event *event)
@@ -333,6 +232,7 @@ static double first_event(Step *step, int rank_held, Event *event)
     if (first == HUGE_VAL)
         return 0.0;
     double reached[N_STATES];
+    find_effort_rates(step, first);
     interpolated(step, first, reached);
     name_event(step, first, reached, event);
     memcpy(step->y_new, reached, sizeof reached);

@@ -30,8 +30,9 @@ static const double FINEST_TOLERANCE = 1.0 / 68719476736.0; /* 2⁻³⁶ */
 static const double NUDGE = 1e-6;
 /* Fraction of the largest step. Joints that an impact moves, and that come to rest within it, stop with the impact. */
 static const double WINDOW = 1.0 / 64.0;
-/* Largest short step, by which an event soon is reached, as a fraction of the largest step. */
-static const double SHORT = 0.25;
+/* Largest short step, by which an event soon is reached, as a fraction of the largest step; and, for joints that stop
+   together, as a multiple of the time to the first one. */
+static const double SHORT = 0.25, LONGER = 1024.0;
 
 /* Determine the regime at y, where joints may rest. */
 static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
@@ -104,15 +105,17 @@ static double first_zero(double distance, double v, double a)
     return v * v < 2.0 * a * distance ? HUGE_VAL : 2.0 * distance / (root - v);
 }
 
-/* Time after which a constant acceleration would stop a joint at a limit or by friction, if it is at most `most`; else
-   HUGE_VAL. */
-static double expected_stop(const Step *step, double most)
+/* Time after which a constant acceleration would stop a joint at a limit or by friction, or efforts that go on to change
+   as in the last regime would release one, if it is at most `most`; else HUGE_VAL. */
+static double expected_event(const Step *step, double most)
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
     double first = HUGE_VAL;
     for (int i = 0; i < N_JOINTS; i++) {
         const double q = step->y[i], v = step->K[0][i], a = step->K[0][N_JOINTS + i];
-        const double reach = (fabs(v) + fabs(a) * most) * most;
+        const double reach = (fabs(v) + fabs(a) * most) * most, rate = step->effort_rate[i];
+        if (step->stops.watched[i] && rate != 0.0)
+            first = fmin(first, fmax(0.0, grip_of(step, i, step->effort[0][i], rate > 0.0 ? 1 : -1)) / fabs(rate));
         if (step->stops.held[i])
             continue;
         if (step->stops.slip[i] * v > 0.0 && step->stops.slip[i] * a < 0.0)
@@ -126,11 +129,12 @@ static double expected_stop(const Step *step, double most)
 }
 
 /* Try a short step of one evaluation to the next event, or to the end if a hold of joints ends there; return its length,
-   with the event, or 0. */
+   with the event, or 0. It is long enough for joints that stop together. */
 static double short_step(Step *step, double left, int hold_ends, int rank_held, Event *event)
 {
-    const double most = SHORT * step->plant->value[MAX_STEP], expected = expected_stop(step, 0.5 * most);
-    step->size = fmin(2.0 * expected, left);
+    const double most = SHORT * step->plant->value[MAX_STEP], expected = expected_event(step, 0.5 * most);
+    const double together = fmin(TOGETHER * step->plant->value[MAX_STEP], LONGER * expected);
+    step->size = fmin(fmax(2.0 * expected, together), left);
     if (!(step->size > 0.0 && step->size <= most && (hold_ends || expected < HUGE_VAL))
         || !(heun(step) / share_of_tolerance(step) < 1.0))
         return 0.0;
@@ -212,6 +216,7 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
     step.evaluations = *evaluations;
     step.stops.rank = N_ROWS;
     step.crossed = 0;
+    memset(step.effort_rate, 0, sizeof step.effort_rate);
     memcpy(step.y, &plant->value[Q], sizeof step.y);
     begin_anti_chatter(&chatter, plant);
     for (int i = 0; stopped_at && i < N_JOINTS; i++)

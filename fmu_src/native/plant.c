@@ -243,7 +243,12 @@ static double acting_effort(const Plant *plant, const double q[N_JOINTS], const 
     EndBody end_body[N_LOADED];
     place_joints(q, joint);
     body(value, 0, end_body);
-    inverse_dynamics(joint, end_body, &value[ARMATURE], v, a, &value[GRAVITY], needed);
+    if (is_held(value))
+        memcpy(needed, &value[TAU], sizeof needed);
+    else if (!COMMANDS_ACCELERATION)
+        command(value, joint, q, v, 0, needed, NULL);
+    else
+        inverse_dynamics(joint, end_body, &value[ARMATURE], v, a, &value[GRAVITY], needed);
     inverse_dynamics(joint, end_body, &value[ARMATURE], v, still, &value[GRAVITY], bias);
     effort_of_force(joint, &value[F_EXT], further);
     for (int i = 0; i < N_JOINTS; i++) {

@@ -12,7 +12,8 @@ from math import inf, sqrt
 
 import numpy as np
 
-from .dormand_prince import State
+from .dormand_prince import Array, State
+from .rosenbrock import CUBIC
 from .stops import Stops
 
 Margin = Callable[[float], float]
@@ -22,24 +23,27 @@ REACH, PACE = 1.66, 3.72
 """Bounds on the weights of Dormand and Prince's interpolant: the largest sum of their magnitudes, and the largest sum
 of the magnitudes of their rates.
 """
-LOOKS, DOUBT = 4, 0.25
-"""Samples of an effort's margin in a step, and a fraction of their range. Between the stages, the margin falls below
-their smallest value by less than the range of their values. If it may therefore be below zero, it is sampled at the
-ends of LOOKS equal intervals, and at each extremum of the polynomial through these samples that is below DOUBT times
-their range.
+DOUBT, LATE = 0.25, 2.0**-8
+"""Fractions of the range of an effort's margin over the stages, and of the resolution of a release. Between the stages,
+the margin falls below their smallest value by less than this range. If it may therefore be below zero, it is sampled
+where a polynomial through the efforts at the stages passes zero, and at each extremum of the polynomial that is below
+DOUBT times the range. The former samples are late by LATE times the resolution: there, rounding does not decide the
+sign.
 """
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
-TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE = 2.0**-52, 2.0**-10, 2.0**-26
-"""Resolutions of an event's time, as fractions of the step: for all events but a release; for a release, the coarsest
-and the finest. At a release the acceleration is 0, so that the state's error grows with the cube of the time's error.
+TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE, COARSEST_RELEASE = 2.0**-52, 2.0**-10, 2.0**-26, 2.0**-5
+"""Resolutions of the time of an event: of all events but a release, as a fraction of the step; the largest and the
+smallest of a release, as fractions of the largest step; and COARSEST_RELEASE times the largest one, as a fraction of a
+short step. At a release the acceleration is 0, so that the error of the state grows with the cube of that of the time.
 """
 TOGETHER, WINDOW, USUAL_RTOL = 2.0**-25, 2.0**-6, 1e-3
 """Fractions of the largest step. Joints that reach rigid stops within the first of an event stop with it. Joints
 that an impact moves, and that come to rest within the second, stop with the impact. Below USUAL_RTOL, the second
 shrinks with rtol, as the first hold at a rigid stop and the resolution of a release do.
 """
-THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
+THROUGH_THIRDS = np.array([[1, -2.75, 3, -1.125], [0, 4.5, -7.5, 3.375], [0, -2.25, 6, -3.375], [0, 0.5, -1.5, 1.125]])
+"""Weights of the efforts at the start, at both thirds and at the end of a stiff step, as those of a dense output."""
 
 
 @dataclass
@@ -66,9 +70,16 @@ def first_zero(distance: float, v: float, a: float) -> float:
     return 2.0 * distance / (sqrt(square) - v) if square >= 0.0 else inf
 
 
-def expected_stop(y: State, rates: State, stops: Stops, most: float) -> float:
-    """Return when a constant acceleration stops a joint at a limit or by friction; infinity if after ``most`` s."""
+def expected_event(
+    y: State, rates: State, stops: Stops, grips: Sequence[float], grip_rates: Sequence[float], most: float
+) -> float:
+    """Return when a joint is expected to stop or to be released, s; infinity if after ``most``.
+
+    A constant acceleration stops it at a limit or by friction; changes of efforts, at the rates at the end of the last
+    regime, release it.
+    """
     n, first = len(stops.limits), inf
+    first = min((max(0.0, grip) / -rate for grip, rate in zip(grips, grip_rates) if rate < 0.0), default=inf)
     for i, (low, high) in enumerate(stops.limits):
         q, v, a = y[i], rates[i], rates[n + i]
         if i in stops.held:
@@ -107,18 +118,20 @@ def search(
     return first
 
 
-def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, resolution: float) -> float:
+def locate(
+    margin: Margin, a: float, at_a: float, b: float, at_b: float, resolution: float, growth: float = 0.01
+) -> float:
     """Return the first time in (a, b] at which a margin is negative, given that it is at b.
 
     The interpolation stays near the middle, so that it never needs many more evaluations than bisection. Source:
     Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020.
     """
-    k = 0.01 / (b - a)  # small, because margins are smooth
+    k = growth / (b - a)  # small, because margins are smooth
     slack = b - a  # how much longer the interval may be than after bisection
     while b - a > resolution:
         middle, half = 0.5 * (a + b), 0.5 * (b - a)
         x = (b * at_a - a * at_b) / (at_a - at_b) if at_a > at_b else middle
-        shift = min(k * (b - a) * (b - a), abs(middle - x))
+        shift = min(max(k * (b - a) * (b - a), 0.25 * resolution), abs(middle - x))
         x += shift if middle > x else -shift
         if abs(x - middle) > slack - half:
             x = middle + (slack - half if x > middle else half - slack)
@@ -192,53 +205,65 @@ def may_vanish(margins: Sequence[float]) -> bool:
     return low != inf and not low >= high - low
 
 
+def release_resolution(step: float, max_step: float, coarseness: float) -> float:
+    """Return the resolution of the time of a release, s; it shrinks with the factor ``coarseness``."""
+    return max(RELEASE_RESOLUTION * coarseness, FINEST_RELEASE) * min(step / COARSEST_RELEASE, max_step)
+
+
 def first_release(
     grips: Callable[[float], Sequence[float]],
-    at_ends: tuple[Sequence[float], Sequence[float]],
+    at_stages: Sequence[Sequence[float]],
+    weights: Array,
     doubtful: Sequence[int],
     step: float,
     before: float,
-    coarseness: float,
+    resolution: float,
 ) -> float:
     """Return the first time before ``before`` at which a joint is released, or infinity.
 
     Args:
         grips: the distances of the holding efforts from their bounds, as a function of the time within the step.
-        at_ends: the same at the start and the end of the step.
+        at_stages: the same at the stages of the step, of which the first and the last are at its ends.
+        weights: those of the dense output, whose rate is a polynomial through values at the stages.
         doubtful: indices of the distances that may reach 0.
         step: size of the step, s.
         before: a time within the step, s.
-        coarseness: factor of the resolution.
+        resolution: of the result, s.
     """
 
     def margin(passed: float) -> float:
         return min(grips(passed))
 
-    instant, resolution = TIME_RESOLUTION * step, max(RELEASE_RESOLUTION * coarseness, FINEST_RELEASE) * step
+    instant, end, at_start = TIME_RESOLUTION * step, min(before, step), min(at_stages[0])
     if before <= instant:
         return inf
-    if (at_once := margin(instant)) < 0.0 and at_once < -abs(margin(0.0) - min(at_ends[0])):
+    if (at_once := margin(instant)) < 0.0 and at_once < -abs(margin(0.0) - at_start):
         return instant  # beyond the difference of two ways to compute the efforts; else the joint would be held again
-    inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
-    margins = [at_ends[0], *inner, at_ends[1]]
-    looks = [x * step for i in doubtful for x in _doubtful_minima([m[i] for m in margins])]
-    for k in range(1, LOOKS + 1):
-        a, b = step * (k - 1) / LOOKS, step * k / LOOKS
-        if a >= before:
-            break
-        at_a, at_b = min(margins[k - 1]), min(margins[k])
-        for look in looks:
-            at_look = margin(look) if a < look < b else 0.0
-            if at_look < 0.0:
-                b, at_b = look, at_look
+    if weights is CUBIC:  # its derivatives are not those at the stages
+        at_stages = [at_stages[0], grips(step / 3), grips(step * 2 / 3), at_stages[-1]]
+        weights = THROUGH_THIRDS
+    looks = [look for i in doubtful for look in _looks([m[i] for m in at_stages], weights, step, LATE * resolution)]
+    a, at_a = 0.0, at_start
+    while a < end:
+        b = min((look for look in looks if a < look < end), default=end)
+        at_b = margin(b) if b < step else min(at_stages[-1])
         if at_b < 0.0:
-            return locate(margin, a, at_a, b, at_b, resolution)
+            return locate(margin, a, at_a, b, at_b, resolution, 0.0)
+        a, at_a = b, at_b
     return inf
 
 
-def _doubtful_minima(margins: Sequence[float]) -> list[float]:
-    """Return the extrema that may be below zero, of the polynomial through equidistant samples of a margin."""
-    c = THROUGH_LOOKS.dot(margins).tolist()
+def grip_rates(at_stages: Sequence[Sequence[float]], weights: Array, x: float) -> Array:
+    """Return the rates of the distances of ``first_release`` at a fraction x of the step, per step."""
+    with np.errstate(invalid="ignore"):  # distances without a bound are infinite
+        rates: Array = np.array(at_stages).T @ (weights @ (0.0, 2.0, 6.0 * x, 12.0 * x * x))
+    return rates
+
+
+def _looks(margins: Sequence[float], weights: Array, step: float, late: float) -> list[float]:
+    """Return times just after a margin, as a polynomial, passes 0, and times of extrema that may be below 0."""
+    c = [k * float(row) for k, row in enumerate(np.array(margins) @ weights, 1)]
     slope = [k * coefficient for k, coefficient in enumerate(c)][1:]
     bound = DOUBT * (max(margins) - min(margins))
-    return [x for x in sign_changes(slope) if _polynomial(c, x) < bound]
+    extrema = [x * step for x in sign_changes(slope) if _polynomial(c, x) < bound]
+    return [x * step + late for x in sign_changes(c)] + extrema

@@ -77,11 +77,14 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
     first = max(FIRST_RIGID_HOLD * motion.coarseness, FIRST_HOLD) if stops.rigid else FIRST_HOLD
     joint_hold, slide, stuck = Hold(), Slide(), [Hold() for _ in range(n)]
     left, slipped = [-inf] * n, [-inf] * n  # last release and start of slip
-    soon, longest = chatter_time, chatter_time  # times of the holds at limits
+    soon, bounds = chatter_time, [inf] * n  # times of the holds at limits
     chattering, anti_chatter = [False] * n, [False] * n
     while t < h:
         motion.check_budget(y)
         if any(chattering):
+            if t - joint_hold.until >= soon:  # the first of a sequence of holds
+                bounds = [bound if chatters else inf for bound, chatters in zip(bounds, chattering)]
+            longest = min(chatter_time, *(bound for bound, at in zip(bounds, stops.at_limits(y)) if at))
             joint_hold.again(t, soon, longest, first)
             anti_chatter = chattering
             if joint_hold.length >= HOLD_OF_ALL * chatter_time and joint_hold.length > first * longest:
@@ -97,7 +100,7 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
                 left[i] = t
             if stops.slip[i] and y[n + i] == 0.0 and i not in stops.held:
                 slipped[i] = t
-        chattering, longest = [False] * n, chatter_time
+        chattering = [False] * n
         soon = chatter_time if stops.rigid else joint_hold.at_once
         motion.crossed |= t > 0.0 and motion.rank != rank
         if motion.rank > rank:
@@ -110,7 +113,7 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
             usual = motion.coarseness if stops.rigid else 1.0
             hold = stop_time(passed, y[n + i], motion.tolerance(y[i]) / usual, chatter_time)
             if passed < (chatter_time if stops.rigid else hold):
-                chattering[i], longest = True, min(longest, hold)
+                chattering[i], bounds[i] = True, hold
                 soon = soon if passed < FIRST_HOLD * chatter_time else max(soon, hold)
         for i in event.arrested:
             if t - slipped[i] < FIRST_HOLD * chatter_time:

@@ -28,8 +28,10 @@ from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock
 from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
-SHORT = 0.25
-"""Longest short step, as a fraction of the largest step."""
+SHORT, LONGER = 0.25, 1024.0
+"""Longest short step, as a fraction of the largest step; and, for joints that stop together, as a multiple of the time
+to the first one.
+"""
 AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
 """Values of the parameter ``integrator``."""
 BUDGET = 2_000_000
@@ -94,6 +96,7 @@ class Motion:
         self.rank = MOST_ROWS
         self.rank_held = self.crossed = False
         self.grips: list[list[float]] = []
+        self._grip_rates: dict[int, list[float]] = {}  # at the end of the last regime, per s
         self.margins: list[float] = []
 
     def set_out(self, y: State, anti_chatter: Sequence[bool], kept: Sequence[bool], rank_held: bool) -> State:
@@ -217,8 +220,10 @@ class Motion:
     ) -> tuple[float, State, events.Event] | None:
         """Return the result of a short step to an event that is expected soon, or to the end of a hold of joints."""
         most = SHORT * self.max_step
-        expected = events.expected_stop(y, rates, self.stops, 0.5 * most)
-        step = min(2.0 * expected, left)
+        grip_rates = [rate for i in self.stops.watched for rate in self._grip_rates.get(i, (0.0, 0.0))]
+        expected = events.expected_event(y, rates, self.stops, self.grips[0], grip_rates, 0.5 * most)
+        together = min(events.TOGETHER * self.max_step, LONGER * expected)
+        step = min(max(2.0 * expected, together), left)
         if not (0.0 < step <= most and (hold_ends or expected < inf)):
             return None
         del self.grips[1:], self.margins[1:]
@@ -264,14 +269,16 @@ class Motion:
             return self._singular_margin(state(passed))
 
         if doubtful:
-            at_ends = self.grips[0], self.grips[-1]
-            first = min(first, events.first_release(grips, at_ends, doubtful, step, first, self.coarseness))
+            resolution = events.release_resolution(step, self.max_step, self.coarseness)
+            first = min(first, events.first_release(grips, self.grips, weights, doubtful, step, first, resolution))
         if near_rank:
             a, b = singular_margin(0.0), singular_margin(step)
             pace = events.PACE / events.REACH * sweep / step
             first = min(first, events.search(singular_margin, pace, 0.0, a, step, b, step))
         if first == inf:
             return None
+        slopes = events.grip_rates(self.grips, weights, first / step) / step
+        self._grip_rates = dict(zip(stops.watched, slopes.reshape(-1, 2).tolist())) if weights is not CUBIC else {}
         last = first + events.TOGETHER * self.max_step if stops.rigid else -inf
         return first, *self._event(state(first), [i for i in crossings if i < n and crossings[i] <= last])
 
