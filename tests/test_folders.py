@@ -29,6 +29,19 @@ def test_an_abandoned_generator_removes_its_unzipped_fmu(fmu_path, tmp_path, mon
     assert list(parent.iterdir()) == []
 
 
+def test_of_a_native_fmu_only_the_library_is_unzipped(native_path, fmu_path, tmp_path, monkeypatch):
+    """A Python FMU reads its resources."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    tops = []
+    for path in (native_path, fmu_path):
+        run = twodof.samples(path, stop_time=1.0)
+        next(run)
+        (folder,) = tmp_path.iterdir()
+        tops.append({file.relative_to(folder).parts[0] for file in folder.rglob("*") if file.is_file()})
+        run.close()
+    assert tops[0] == {"binaries"} and {"binaries", "resources", "modelDescription.xml"} <= tops[1]
+
+
 RUN_THAT_WAITS = """
 import os, signal, sys, tempfile
 tempfile.tempdir = sys.argv[2]

@@ -96,6 +96,12 @@ class Fmu:
         return str(self.description.guid)
 
     @property
+    def is_native(self) -> bool:
+        """True if the FMU is a native one of this package, which needs no file but its library."""
+        own = str(self.description.generationTool).startswith("twodof ")
+        return own and not self.description.coSimulation.needsExecutionTool
+
+    @property
     def library(self) -> str:
         """File name of its binary on this platform."""
         identifier = self.description.coSimulation.modelIdentifier

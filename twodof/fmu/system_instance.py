@@ -219,7 +219,8 @@ def _part(values: Values, first: int, size: int) -> Values:
 def instantiate_fmu(fmu: Fmu, name: str = "") -> Iterator[Instance]:
     """Instantiate an FMU from a temporary folder, and free the instance at the end.
 
-    Its documentation is not unzipped. The name of the instance is that of its model by default.
+    Its documentation is not unzipped, and of a native FMU of this package only the library is. The name of the instance
+    is that of its model by default.
     """
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
@@ -228,8 +229,9 @@ def instantiate_fmu(fmu: Fmu, name: str = "") -> Iterator[Instance]:
         raise FmuError(f"'{fmu.path}' has no binary for this platform ({here}), only for: {there}{remedy}")
     with temporary_folder() as folder:
         with opened(fmu) as archive:
-            names = archive.namelist()
-            archive.extractall(folder, [name for name in names if not name.startswith(READ)])
+            own = f"binaries/{fmu.platform}/" if fmu.is_native else ""
+            names = [name for name in archive.namelist() if name.startswith(own) and not name.startswith(READ)]
+            archive.extractall(folder, names)
         check_python_wrapper(fmu.path, folder / "binaries" / fmu.platform / fmu.library, folder, fmu.members)
         instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder, name)
         try:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 
 from ..errors import FmuError, SimulationError
-from ..fmu import Fmu, Instance, System, SystemInstance, evaluations_in, instantiate
+from ..fmu import Instance, System, SystemInstance, evaluations_in, instantiate
 from ..fmu.instance import logger
 from ..signatures import ignore
 from .experiments import Experiment
@@ -26,12 +26,7 @@ TOO_LONG = "the run takes too long"
 def is_repeatable(run: Experiment) -> bool:
     """Return whether a run is short, and of native FMUs of this package, which have no effects outside."""
     parts = run.fmu.components.values() if isinstance(run.fmu, System) else [run.fmu]
-    return run.steps <= MOST_STEPS and all(map(_is_native, parts))
-
-
-def _is_native(fmu: Fmu) -> bool:
-    own = str(fmu.description.generationTool).startswith("twodof ")
-    return own and not fmu.description.coSimulation.needsExecutionTool
+    return run.steps <= MOST_STEPS and all(fmu.is_native for fmu in parts)
 
 
 @dataclass
