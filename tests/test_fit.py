@@ -18,7 +18,7 @@ import pinocchio as pin
 import pytest
 import scipy.optimize
 import scipy.signal
-from motions import assert_true, bag_of, move, mujoco_model, noisy
+from motions import assert_true, bag_of, follow, move, mujoco_model, noisy
 
 import twodof
 from twodof.cli.main import main
@@ -26,9 +26,10 @@ from twodof.errors import InputError
 from twodof.identification import curves as prediction_curves
 from twodof.identification import estimate as estimation
 from twodof.identification import fitting, parameters, stretches
-from twodof.identification.estimate import Misfit, Suspect, estimate
+from twodof.identification.estimate import estimate
 from twodof.identification.fitting import read_model
 from twodof.identification.inertials import dynamic_parameters
+from twodof.identification.model_tests import Misfit, Suspect
 from twodof.identification.regression import modelled, rows_of
 from twodof.plant.urdf import read_urdf
 
@@ -290,6 +291,86 @@ def test_an_error_of_the_model_is_named_or_can_be_a_parameter(error, words, moti
     most = 4.0 if error == "filter" else 3.0  # the test of a filter has its effect in the second order alone
     for p in (p for p in result.parameters if p.name in TRUTH):
         assert abs(p.after - TRUTH[p.name]) <= most * p.deviation, (p, TRUTH[p.name])
+
+
+def paused_motion(move: float, pause: float, seconds: float) -> Any:
+    """The arm's motion along sums of sines, with pauses that begin and end within 0.1 s."""
+    model = mujoco_model(ARM.read_text("utf-8"), payload=0.15, end="EndEffector", **HIDDEN)
+    rng = np.random.default_rng(0)
+    omega, phase = 4.0 * np.pi * rng.uniform(0.1, 1.0, (5, 2)), rng.uniform(0.0, 2.0 * np.pi, (5, 2))
+    reaches = 0.4 * rng.uniform(0.5, 1.0, (5, 2)) * omega.min(axis=0) / omega
+    t = 1e-3 * np.arange(round(1000.0 * seconds) + 1)
+    knots = np.cumsum([0.0, move, 0.1, pause, 0.1])
+    speed = 0.5 + 0.5 * np.cos(np.pi * np.interp(t % knots[-1], knots, [0.0, 0.0, 1.0, 1.0, 2.0]))
+    way, rate = np.cumsum(speed) * 1e-3, np.gradient(speed, 1e-3)
+
+    def target(now: float) -> Any:
+        k = round(1000.0 * now)
+        waves = reaches * np.exp(1j * (omega * way[k] + phase))
+        q, v, a = (np.sum((1j * omega) ** order * waves, axis=0).imag for order in range(3))
+        return np.add(q, [-0.5, 0.6]), v * speed[k], a * speed[k] ** 2 + v * rate[k]
+
+    return follow(model, target, seconds, target(0.0)[0])
+
+
+def test_short_pauses_do_not_look_like_a_filter():
+    """Short stretches of motion reached beyond the band, into the edge of the filter of positions."""
+    q, v, effort = paused_motion(0.4, 0.1, 60.0)
+    model = read_model(ARM, FREE)
+    free = model.parameters(GRAVITY)
+    for seed in range(3):
+        measured, efforts = noisy((q, v, effort), seed, part=0.003)
+        recording: Any = SimpleNamespace(path="bag", joints=JOINTS, t=0.01 * np.arange(len(q)), q=measured, tau=efforts)
+        found = estimate(free, stretches.stretches([recording], model.robot)[0])
+        assert not found.suspects and not found.holds
+        deviations = np.sqrt(np.diag(found.covariance))
+        assert (np.abs(free.reported(found.values) - [*TRUTH.values()]) <= 4.0 * deviations).all()
+        assert deviations[4] < 0.012 * TRUTH["armature[1]"]
+
+
+def test_a_joint_that_rests_under_more_than_its_friction_is_named(tmp_path):
+    """A brake: at rest, the effort is 0.2 N·m off, and friction 0.08 N·m holds at most that on either side."""
+    q, v, effort = paused_motion(1.0, 1.0, 40.0)
+    rests = np.abs(v[:, 0]) < 1e-3
+    braked = effort - np.outer(rests, [0.2, 0.0])
+    for tau, holds in ((effort, False), (braked, True)):
+        bag = bag_of(tmp_path / f"bag{holds}", JOINTS, *noisy((q, v, tau)))
+        result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)
+        assert_true(result, TRUTH)
+        assert [JOINTS[hold.joint] for hold in result.holds] == ["joint1"] * holds
+        assert ("a brake holds the joint" in str(result)) is holds is not result.explains
+        assert all(0.04 < hold.excess <= 0.2 and rests[round(100 * hold.t)] for hold in result.holds)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.5, 0.9])
+def test_noise_in_proportion_to_the_effort_has_its_own_weights(part):
+    rng, count = np.random.default_rng(7), 4000
+    power = rng.exponential(size=count) ** 2
+    truth = np.sqrt(1.0 - part + part * power / power.mean())
+    rows: Any = SimpleNamespace(bin=np.arange(count) % 6, power=power, tau=np.ones(count))
+    found = estimation._deviations(rows, truth * rng.normal(size=count))
+    assert np.median(np.abs(found / truth - 1.0)) < 0.05
+
+
+def test_a_change_that_an_error_too_small_to_see_would_make_is_named(bag):
+    """An interval grows by it, if the errors are free."""
+    result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)
+    (narrow,) = (p for p in result.parameters if p.name == "payload")
+    (wide,) = (p for p in twodof.fit(ARM, bag, (*FREE, "bias:*"), gravity=GRAVITY).parameters if p.name == "payload")
+    expected = 1.96 * np.sqrt((wide.deviation / narrow.deviation) ** 2 - 1.0)
+    assert result.fragile["payload"] == pytest.approx(expected, rel=0.2) and expected > 3.0
+    assert "constant errors of efforts could move payload by" in str(result)
+
+
+def test_a_joint_that_reverses_too_often_is_refused(bag):
+    """It moves in one direction for at most 0.1 s."""
+    model = read_model(ARM, FREE)
+    fitted, _ = stretches.stretches([twodof.read_bag(bag)], model.robot)
+    hasty = [
+        each._replace(moving=np.arange(len(each.t))[:, None] % [1000, 14] < 10 * np.array([90, 1])) for each in fitted
+    ]
+    with pytest.raises(InputError, match="joint 'joint2' reverses too often for a fit: record slower motions of it"):
+        estimate(model.parameters(GRAVITY), hasty)
 
 
 def test_a_constant_error_of_the_efforts_can_be_a_parameter(motion, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, count, repeat
 from math import floor, inf
@@ -24,11 +25,13 @@ from ..simulation.input_values import Changes, Setting, Value, resolve
 from .contents import read_messages
 from .provenance import KNOWN_UNTIL, read_provenance, robot_in
 from .reader import whole_bag
+from .recording import Recording
 from .records import DamageError, ReadBudget
 
 LOG = logging.getLogger(__name__)
 COMMAND_SIZE = 150  # bytes that a message takes in memory in addition to its own
 SAMPLES = (JOINT_STATES, TRUE_STATES, END_EFFECTOR)  # topics of a robot's motion, not of commands
+COMMANDS = "/joint_commands"
 FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs that trajectories set
 Read = TypeVar("Read", Command, Trajectory)
 Stored = list[tuple[int, str, bytes]]
@@ -90,6 +93,36 @@ def read_commands(
         return _followed(commands, begin, fmu, resolve(fmu, settings or {}), step, f"'{path}'")
     read = _read(commands, begin, lambda _, kind, data: follows.read(kind, data), f"'{path}'")
     return [((came - begin) / NANOSECONDS, dict(command.inputs)) for came, command in read]
+
+
+def has_joint_commands(recording: Recording) -> bool:
+    """Return whether a bag has joint states on another topic than those of the robot."""
+    return any(topic.type == JOINT_STATE and topic.name not in SAMPLES for topic in recording.topics)
+
+
+def joint_commands(
+    path: Path, recording: Recording
+) -> tuple[tuple[str, str, str], list[tuple[float, Mapping[str, Value]]]]:
+    """Return an FMU's URDF, frame and axes, and all its values at each of a bag's commands from a time, s, on.
+
+    The first time is that at which each joint has had a command.
+
+    Raises:
+        InputError: the bag has no such commands.
+    """
+    if not has_joint_commands(recording):
+        raise InputError(
+            f"'{recording.path}' has no efforts, and no run.json or commands that give them: record the efforts, or the"
+            f" topic {COMMANDS}"
+        )
+    fmu, usual = load_fmu(path), any(topic.name == COMMANDS for topic in recording.topics)
+    starts = {name: each.start_value for name, each in fmu.variables.items() if each.start_value is not None}
+    schedule, changed = list[tuple[float, Mapping[str, Value]]](), dict[str, Value]()
+    for at, values in read_commands(fmu, recording.path, COMMANDS if usual else None):
+        changed = {**changed, **values}
+        if changed.keys() >= {*fmu.vector("q_des"), *fmu.vector("tau_cmd")}:
+            schedule.append((at, ChainMap(changed, starts)))
+    return (fmu.urdf or "", fmu.frame, fmu.axes), schedule
 
 
 def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict[str, Stored], dict[str, int], int]:

@@ -10,7 +10,16 @@ from pathlib import Path
 from ..version import install
 from .fmus import is_robot
 from .help import Parser
-from .options import CommandLineError, add_options, add_output, given_options, links, not_empty, parse_locks
+from .options import (
+    CommandLineError,
+    add_options,
+    add_output,
+    given_options,
+    links,
+    not_empty,
+    parse_locks,
+    parse_settings,
+)
 from .printing import plain, print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED
 
@@ -38,6 +47,8 @@ def add(fit: Parser) -> None:
     option("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
     text = "gravity, m/s2 in the root frame (the run's, else 0 0 -9.81)"
     option("--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"), help=text)
+    text = "gains of joint control, for bags of /joint_commands without efforts: Kp=100; repeatable"
+    option("--set", dest="settings", metavar="NAME=VALUE", help=text, action="append", default=[])
     add_options(fit, "--lock", "--json")
 
 
@@ -61,6 +72,7 @@ def call(options: argparse.Namespace) -> int:
             options.free,
             output=output,
             lock=parse_locks(options.locks),
+            settings=parse_settings(options.settings),
             progress=progress,
             **given_options(options, "frame", "gravity"),
         )

@@ -21,6 +21,7 @@ OPTIONS = {
     "changes": "--input",
     "robots": "NAME=FMU",
     "set_gains": "--foxglove-control",
+    "settings": "--set",
 }
 """Options whose names differ from the library's argument."""
 NEEDS = {"plot": "matplotlib", "view": "websockets"}

@@ -28,11 +28,11 @@ from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
 from ..signatures import with_keywords_of
 from .curves import efforts
-from .estimate import DELAY_SCALE, FIRST_NOISE, PRIOR, information_root, typical
+from .estimate import DELAY_SCALE, FIRST_NOISE, PRIOR, typical
 from .fit_result import check_folder
 from .fitting import GRAVITY, ModelOptions, read_model
 from .parameters import Parameters
-from .regression import Rows, position_derivatives, regressors
+from .regression import Rows, information_root, position_derivatives, regressors
 from .stretches import Array, Stretch
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ class _Design:
         rows = []
         for i, (sign, v, a, one, tau, tau_rate) in enumerate(signals.transpose(2, 0, 1)):
             gravity = G[:, :, i].swapaxes(0, 1)
-            own = sign, v, a, one, tau, tau_rate, turning[:, i], rate, none  # `rate`: it has no unmodelled errors
+            own = sign, v, a, one, tau, tau_rate, turning[:, i], rate, none, tau  # `rate`: it has no unmodelled errors
             rows.append(Rows(i, varying, Y[:, i], gravity, *own, about))
         sd = [np.full(len(Y), noise) for noise in self._noise]
         J = information_root(self._parameters, rows, sd, self._z) * self._scales

@@ -19,27 +19,15 @@ from ..files import refusing, temporary_folder
 from ..notebook import card
 from ..version import __version__
 from .curves import Curve, Table
-from .estimate import Misfit, Suspect
+from .model_tests import ERRORS, Hold, Misfit, Suspect
 from .prediction import WINDOW
 
 MOST_NAMES = 6
 """Largest number of parameters that the page names in its verdict."""
 UNEXPLAINED = 0.01
 """Slow residuals that are not noise, as a fraction of the efforts, above which the model does not explain the data."""
-ERRORS = {
-    "gravity": "a base that is tilted by about {size:.2g} {unit} (free '{name}')",
-    "offset": "positions of joint '{joint}' that need about {size:+.2g} {unit} (free '{name}')",
-    "gain": "efforts of joint '{joint}' that need about {percent:+.3g} % (free '{name}')",
-    "gains": "efforts of all joints that need about {percent:+.3g} % (free 'gain:*')",
-    "bias": "efforts of joint '{joint}' that are about {size:.2g} {effort} too high, or friction that is higher by this"
-    " in the positive direction (free '{name}')",
-    "drag": "damping of joint '{joint}' by the square of its speed, {size:.2g} {effort} at 1 {unit}/s (record at the"
-    " speeds of the task)",
-    "load": "friction of joint '{joint}' that grows by about {percent:.2g} % of its load (record with the loads of the"
-    " task)",
-    "filter": "{filtered} behind a filter with a time constant of about {ms:.2g} ms (record them without it)",
-    "clock": "speeds that need about {percent:+.2g} %, as of a wrong clock",
-}
+FRAGILE = 3.0
+"""Change of a value by an error that the data cannot show, in standard deviations, above which a remark names it."""
 ALIKE = 100.0
 """Ratio of the probabilities of two errors, below which the data do not tell one from the other."""
 MOST_COMBINATIONS = 5
@@ -82,6 +70,9 @@ class Fit:
         unseen: parameters that form each direction that the data do not determine.
         misfits: test of the model at each joint.
         suspects: errors of the setup that the residuals show, for which the intervals are wider.
+        holds: rests of joints under more than their friction.
+        fragile: largest change of each parameter, in standard deviations, by constant errors of efforts that the data
+            cannot show.
         noise: standard deviation of the efforts' residuals at each joint, N·m or N.
         delay: time from a recorded effort to its action, s, and its standard deviation.
         deviation_before, deviation: root mean square of simulated minus measured positions of each joint in the
@@ -103,6 +94,8 @@ class Fit:
     unseen: tuple[str, ...]
     misfits: tuple[Misfit, ...]
     suspects: tuple[Suspect, ...]
+    holds: tuple[Hold, ...]
+    fragile: Mapping[str, float]
     noise: tuple[float, ...]
     delay: tuple[float, float]
     deviation_before: tuple[float, ...]
@@ -117,9 +110,8 @@ class Fit:
     @property
     def explains(self) -> bool:
         """True if the fit has converged, the residuals are noise, and the efforts do not jump between samples."""
-        return (
-            self.converged and not self.jumps and not self.suspects and not any(misfit.bad for misfit in self.misfits)
-        )
+        bad = self.jumps or self.suspects or self.holds or any(misfit.bad for misfit in self.misfits)
+        return self.converged and not bad
 
     @property
     def rows(self) -> list[tuple[str, str, str, str, str]]:
@@ -160,9 +152,10 @@ class Fit:
             lines.append(self._verdict(max(bad, key=lambda misfit: misfit.part)))
         if self.suspects:
             lines.append(self._suspicion())
-        for joint, t in self.jumps.items():
+        lines += map(self._rest, self.holds)
+        for name, t in self.jumps.items():
             lines.append(
-                f"the effort of joint '{joint}' jumps between samples, most at {t:.4g} s: its course there is"
+                f"the effort of joint '{name}' jumps between samples, most at {t:.4g} s: its course there is"
                 " unknown, and the intervals are too narrow; record at a higher rate, or a smoother motion"
             )
         if not lines:
@@ -170,6 +163,11 @@ class Fit:
         groups = {parameter.name.partition(":")[0] for parameter in self.parameters}
         if "gain" in groups and "mass" not in groups:
             lines.append("gains are right only if the URDF's masses are: free 'mass:*' too, or weigh the robot")
+        if moved := [name for name, most in self.fragile.items() if most > FRAGILE]:
+            lines.append(
+                f"too small for these data to show, constant errors of efforts could move {', '.join(moved)} by"
+                f" {max(self.fragile.values()):.2g} standard deviations: free 'bias:*' if there may be some"
+            )
         if abs(self.delay[0]) > 5.0 * self.delay[1]:
             side = "after" if self.delay[0] > 0.0 else "before"
             lines.append(f"efforts act {1e3 * abs(self.delay[0]):.3g} ms {side} their stamps")
@@ -186,6 +184,13 @@ class Fit:
             f"the model {verdict} at joint '{joint}': slow residuals of {worst.rms:.3g} {unit},"
             f" {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the variance of fast ones; free"
             " more parameters, or look for what the URDF does not have"
+        )
+
+    def _rest(self, hold: Hold) -> str:
+        return (
+            f"joint '{self.joints[hold.joint]}' rests at {hold.t:.4g} s under {hold.excess:.3g}"
+            f" {self._effort_unit(hold.joint)} more than its friction holds: friction at rest is higher than in motion,"
+            " a brake holds the joint, or the model lacks a load"
         )
 
     def _suspicion(self) -> str:
@@ -242,6 +247,8 @@ class Fit:
             "jumps": dict(self.jumps),
             "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
             "suspects": [suspect._asdict() for suspect in self.suspects],
+            "holds": [hold._asdict() | {"joint": self.joints[hold.joint]} for hold in self.holds],
+            "fragile": dict(self.fragile),
             "noise": dict(zip(self.joints, self.noise)),
             "delay": {"value": self.delay[0], "deviation": self.delay[1]},
             "held_out": {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from itertools import combinations, count
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
@@ -13,14 +12,15 @@ import numpy as np
 from ..bag.reader import read_bag
 from ..bag.recording import Recording
 from ..errors import InputError
+from ..export.fmu_options import FmuOptions
 from ..export.urdf_source import end_effector, last_links, lock_joints, read_text
 from ..files import shown
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from ..signatures import with_keywords_of
-from .commanded import commanded_efforts
+from .commanded import with_efforts
 from .curves import Comparison, compare
-from .estimate import PASSES, Estimate, estimate
+from .estimate import NORMAL_95, PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
 from .fitted_urdf import fitted_urdf, parsed
 from .parameters import Dynamics, Parameters
@@ -38,7 +38,6 @@ WRONG_UNITS = 300.0
 """Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
 WRONG_RANGE = 3.0
 """Ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected."""
-NORMAL_95 = 1.959964
 POSITIVE = ("friction", "damping", "armature", "payload", "mass")
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -98,6 +97,7 @@ def fit(
     free: str | Sequence[str],
     *,
     output: str | Path | None = None,
+    settings: Mapping[str, object] | None = None,
     progress: Callable[[int, int], None] | None = None,
     **options: Unpack[ModelOptions],
 ) -> Fit:
@@ -112,6 +112,8 @@ def fit(
         free: names or shell patterns of the free parameters: ``friction[1]``, ``damping[1]``, ``armature[1]``,
             ``offset:JOINT``, ``gain:JOINT``, ``bias:JOINT``, ``mass:LINK``, ``com:LINK``, ``inertia:LINK``,
             ``payload``, ``payload_com``, ``gravity``.
+        settings: gains of joint control, Kp and Kd, and other settings of a build, for bags with commands and without
+            efforts; None: their commands are efforts.
         output: new folder for robot.urdf, fit.json and fit.html; None: nothing is written.
         frame: link of the payload; None: "EndEffector", or the only last link.
         lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
@@ -129,11 +131,12 @@ def fit(
     model, gravity = read_model(urdf, free, **options), options.get("gravity")
     parsed(model.text)  # so that a URDF that cannot be written is refused before the computation
     recordings = _recordings(bags)
-    parameters = model.parameters(_recorded_gravity(recordings) if gravity is None else tuple(gravity))
+    gravity = _recorded_gravity(recordings) if gravity is None else tuple(map(float, gravity))
+    controller = _controller(model, gravity, options, settings or {})
+    given, recordings = recordings, [with_efforts(each, controller) for each in recordings]
+    parameters = model.parameters(gravity)
     fitted, held = stretches(recordings, model.robot)
-    for bag, recording in enumerate(recordings):
-        if own := [stretch for stretch in fitted if stretch.bag == bag]:
-            _check_units(parameters, own, shown(recording.path))
+    _check_all_units(parameters, fitted, recordings)
     finished = _counter(progress, PASSES + 2 * len(held))
     found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
@@ -142,10 +145,21 @@ def fit(
     except KeyboardInterrupt:
         found = found._replace(interrupted=True)
         compared = compare(model.robot, models, fitted, [], finished)
-    result = _result(model, parameters, found, compared, recordings)
+    given = [raw if raw.tau.size else each for raw, each in zip(given, recordings)]
+    result = _result(model, parameters, found, compared, given)
     if output is not None:
         result.save(output)
     return result
+
+
+def _controller(
+    model: Model, gravity: Sequence[float], options: ModelOptions, settings: Mapping[str, object]
+) -> FmuOptions:
+    """Return options of the FMU whose law made the efforts of a bag with commands."""
+    x, y, z = gravity
+    control, lock = "joint" if settings else "effort", options.get("lock") or {}
+    own = dict(meshes=False, frame=model.robot.frame, lock=lock, gravity=(x, y, z), control=control, settings=settings)
+    return FmuOptions(model.path, **own)  # type: ignore[arg-type]
 
 
 def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callable[[], None]:
@@ -161,13 +175,10 @@ def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callabl
 
 
 def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
-    """Return the recordings of bags, with efforts; raise InputError if there are none, or one counts twice."""
+    """Return the recordings of bags; raise InputError if there are none, or one counts twice."""
     recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
     if not recordings:
         raise InputError("a fit needs a bag")
-    recordings = [
-        each if each.tau.shape == each.q.shape else replace(each, tau=commanded_efforts(each)) for each in recordings
-    ]
     for a, b in combinations(recordings, 2):
         if np.array_equal(a.t, b.t) and np.array_equal(a.q, b.q):
             raise InputError(f"'{b.path}' has the motion of '{a.path}', which would count twice; leave one out")
@@ -178,6 +189,13 @@ def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
     """Return the gravity of the run that made the first bag, m/s²."""
     starts = recordings[0].provenance.get("start_values") or {}
     return tuple(float(starts.get(f"gravity[{k + 1}]", GRAVITY[k])) for k in range(3))
+
+
+def _check_all_units(parameters: Parameters, fitted: Sequence[Stretch], recordings: Sequence[Recording]) -> None:
+    """Check the units of each bag that is fitted."""
+    for bag, recording in enumerate(recordings):
+        if own := [stretch for stretch in fitted if stretch.bag == bag]:
+            _check_units(parameters, own, shown(recording.path))
 
 
 def _check_units(parameters: Parameters, fitted: Sequence[Stretch], bag: str) -> None:
@@ -262,6 +280,8 @@ def _result(
         unseen=tuple(_unseen(parameters, found)),
         misfits=found.misfits,
         suspects=found.suspects,
+        holds=found.holds,
+        fragile=dict(zip(parameters.names, found.fragile.tolist())),
         noise=tuple(found.noise.tolist()),
         delay=found.delay,
         deviation_before=compared.deviations[0],

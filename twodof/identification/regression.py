@@ -14,7 +14,7 @@ likelihood by frequency.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -24,13 +24,15 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
+from ..errors import InputError
 from ..plant.robot import Robot
 from .inertials import model_with
 from .parameters import Dynamics, Parameters
-from .stretches import Array, Stretch
+from .stretches import EDGE, Array, Stretch
 
 LEAST_SAMPLES, LONGEST = 12, 400
 """Smallest and largest number of samples of a stretch in which a joint moves; a longer one is divided."""
+MOST_RESTING = 40  # samples of a stretch in which a joint may rest
 EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Edges of the frequency bins, in each of which noise has one variance, as fractions of the band."""
 UNMODELLED = ("drag", "load", "filter")
@@ -51,6 +53,7 @@ class Rows(NamedTuple):
         offsets: derivative of the inverse dynamics with respect to positions, K × n.
         unmodelled: efforts of each of UNMODELLED of size 1, K × 3.
         bin: index of each row's frequency bin, K.
+        power: mean square of the recorded effort where each row weighs it, K.
         about: offsets, n, and delay of the efforts, s, at which the rows were linearised.
     """
 
@@ -67,6 +70,7 @@ class Rows(NamedTuple):
     offsets: Array
     unmodelled: Array
     bin: NDArray[np.int64]
+    power: Array
     about: tuple[Array, float]
 
 
@@ -107,38 +111,70 @@ def rows_of(
     parameters: Parameters, values: Dynamics, stretches: Sequence[Stretch], delay: float, with_offsets: bool
 ) -> list[Rows]:
     """Return the rows of each joint, linearised at values of the parameters and a delay of the efforts, s."""
-    robot, varying = parameters.robot, parameters.varying
-    found: list[list[Rows]] = [[] for _ in robot.joints]
-    about = (values.offset, delay)
+    found: list[list[Rows]] = [[] for _ in parameters.robot.joints]
     for stretch in stretches:
-        Y, G = regressors(robot, stretch, values, varying)
-        turning = position_derivatives(robot, values, stretch, with_offsets)
-        late = _delayed(stretch, delay)
-        rate = np.gradient(late, stretch.step, axis=0)
-        joint = np.sign(stretch.v), stretch.v, stretch.a, np.ones_like(rate), late, rate
-        signals = np.dstack([*joint, *unmodelled(stretch, values, Y, G, varying)])
+        rows_in = projector(parameters, values, stretch, delay, with_offsets)
         for i, rows in enumerate(found):
             for begin, end in _runs(stretch.moving[:, i]):
-                if end - begin < LEAST_SAMPLES:
-                    continue
-                at = slice(begin, end)
+                # by fading, functions of short stretches would reach beyond the band, into the filter's edge
                 frequency = np.arange(end - begin) / (2.0 * (end - begin) * stretch.step)
-                keep = int(np.searchsorted(frequency, stretch.band[i]))
-                size, n = Y.shape[2], len(robot.joints)
-                gravity = (G[at, axis, i] for axis in range(3))
-                columns = np.column_stack([Y[at, i], *gravity, turning[at, i], signals[at, i]])
-                parts = np.split(smooth_basis(end - begin, keep) @ columns, [size, 4 * size, 4 * size + n], axis=1)
-                bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
-                G_rows = parts[1].reshape(keep, 3, size).transpose(1, 0, 2)
-                sign, v, a, one, tau, tau_rate, *others = parts[3].T
-                own = sign, v, a, one, tau, tau_rate, parts[2], np.column_stack(others), bins
-                rows.append(Rows(i, varying, parts[0], G_rows, *own, about))
+                keep = max(0, int(np.searchsorted(frequency, stretch.band[i])) - 1)
+                if end - begin >= LEAST_SAMPLES and keep:
+                    bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
+                    rows.append(rows_in(i, slice(begin, end), smooth_basis(end - begin, keep), bins))
+    for joint, rows in zip(parameters.robot.joints, found):
+        if not rows:
+            raise InputError(f"joint '{joint}' reverses too often for a fit: record slower motions of it")
     return [_joined(rows) for rows in found]
+
+
+def resting_rows(
+    parameters: Parameters, values: Dynamics, stretches: Sequence[Stretch], delay: float
+) -> Iterator[tuple[Rows, int, float]]:
+    """Yield, for each stretch in which a joint may rest, its row, the number of samples in it, and its time, s.
+
+    The row is the mean of up to MOST_RESTING samples, times the square root of their number.
+    """
+    for stretch in stretches:
+        edge = int(np.ceil(EDGE / stretch.step))
+        for i in range(len(parameters.robot.joints)):
+            for begin, end in _runs(~stretch.moving[:, i]):
+                if end - begin > 3 * edge:
+                    part = stretch.part(slice(begin + edge, end - edge, max(1, (end - begin) // MOST_RESTING)))
+                    n = len(part.t)
+                    rows_in = projector(parameters, values, part, delay, True)
+                    yield rows_in(i, slice(None), np.full((1, n), n**-0.5), np.zeros(1, np.int64)), n, part.t[0]
+
+
+def projector(
+    parameters: Parameters, values: Dynamics, stretch: Stretch, delay: float, with_offsets: bool
+) -> Callable[[int, slice, Array, NDArray[np.int64]], Rows]:
+    """Return a function that makes rows of a joint from a part of a stretch, in a basis with bins of frequency."""
+    robot, varying = parameters.robot, parameters.varying
+    Y, G = regressors(robot, stretch, values, varying)
+    turning = position_derivatives(robot, values, stretch, with_offsets)
+    late = _delayed(stretch, delay)
+    rate = np.gradient(late, stretch.step, axis=0)
+    joint = np.sign(stretch.v), stretch.v, stretch.a, np.ones_like(rate), late, rate
+    signals = np.dstack([*joint, *unmodelled(stretch, values, Y, G, varying)])
+    size, n = Y.shape[2], len(robot.joints)
+
+    def rows_in(i: int, at: slice, basis: Array, bins: NDArray[np.int64]) -> Rows:
+        gravity = (G[at, axis, i] for axis in range(3))
+        columns = np.column_stack([Y[at, i], *gravity, turning[at, i], signals[at, i]])
+        parts = np.split(basis @ columns, [size, 4 * size, 4 * size + n], axis=1)
+        G_rows = parts[1].reshape(len(basis), 3, size).transpose(1, 0, 2)
+        sign, v, a, one, tau, tau_rate, *others = parts[3].T
+        power = basis**2 @ stretch.tau[at, i] ** 2
+        own = sign, v, a, one, tau, tau_rate, parts[2], np.column_stack(others), bins, power
+        return Rows(i, varying, parts[0], G_rows, *own, (values.offset, delay))
+
+    return rows_in
 
 
 def _joined(rows: list[Rows]) -> Rows:
     """Return the rows of all stretches of a joint as one."""
-    names = ("Y", "G", "sign", "v", "a", "one", "tau", "tau_rate", "offsets", "unmodelled", "bin")
+    names = ("Y", "G", "sign", "v", "a", "one", "tau", "tau_rate", "offsets", "unmodelled", "bin", "power")
     parts: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in rows], axis=int(name == "G")) for name in names
     }
@@ -237,6 +273,13 @@ def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
         columns += np.outer(column, getattr(rates, group)[i])
     columns -= np.outer(modelled(rows, values) / gain, rates.gain[i])
     return np.column_stack([-columns / gain, -rows.tau_rate])
+
+
+def information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:
+    """Return the Jacobian of the whitened residuals with respect to the coordinates and, last, the delay."""
+    dynamics = parameters.dynamics(parameters.values(z[:-1]))
+    rates = parameters.rates(z[:-1])[1]
+    return np.vstack([jacobian(each, dynamics, rates) / s[:, None] for each, s in zip(rows, sd)])
 
 
 def stretched(rows: Rows, values: Dynamics) -> Array:
