@@ -18,7 +18,8 @@ static Status discard(Instance *instance, double point, double h, const Failure 
     const double *value = instance->state.plant.value;
     if (failure->reason == NOT_FINITE)
         return report(instance, DISCARD, "%s at %.12g s: the equations of motion gave a value"
-                      " that is not finite: inputs, payload or speeds are too large", call, point);
+                      " that is not finite: inputs, payload or speeds are too large, or joint '%s', which changes at a rate of"
+                      " %.3g 1/s, needs armature or a lock", call, point, JOINT_NAME[failure->joint], failure->rate);
     if (failure->reason == MANY_STEPS || failure->reason == SHORT_PERIOD) {
         const int limit = failure->reason == MANY_STEPS ? MAX_STEP : CONTROL_PERIOD;
         return report(instance, DISCARD, "%s at %.12g s: %s = %g s divides a step of %g s into more than %d"

@@ -59,8 +59,7 @@ def advance(
         q and v at the end; q is within the limits to the last bit.
 
     Raises:
-        FloatingPointError: the equations gave a value that is not finite.
-        StepError: the state changes too fast.
+        StepError: the state changes too fast, or the equations gave a value that is not finite.
     """
     n, budget, motion = len(q), budget or Budget(), Motion(equations, stops, rtol, atol, max_step, integrator)
     motion.evaluations = budget.spent

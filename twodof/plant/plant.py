@@ -153,12 +153,18 @@ class Plant(ControlledPlant):
             self.q, self.v, self.sampling, self.time = before
             if not isinstance(error, StepError):
                 raise
+            joint = f"joint '{self.robot.joints[error.joint]}'"
+            if not error.finite:
+                raise DiscardError(
+                    "the equations of motion gave a value that is not finite: inputs, payload or speeds are too large,"
+                    f" or {joint}, which changes at a rate of {error.rate:.3g} 1/s, needs armature or a lock"
+                ) from error
             need = f"more than {BUDGET} evaluations for the step of {h:g} s"
             if error.too_fine:
                 need = "integration steps below the resolution of time"
             raise DiscardError(
-                f"rtol = {self.rtol:g} and atol = {self.atol:g} need {need}: joint"
-                f" '{self.robot.joints[error.joint]}' changes at a rate of {error.rate:.3g} 1/s;"
+                f"rtol = {self.rtol:g} and atol = {self.atol:g} need {need}:"
+                f" {joint} changes at a rate of {error.rate:.3g} 1/s;"
                 " shorten the step, lessen damping or gains, or enlarge rtol and atol"
             ) from error
         self.time += h

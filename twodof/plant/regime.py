@@ -48,11 +48,12 @@ class StepError(ArithmeticError):
         too_fine: whether even the smallest integration step failed, so that a larger budget would not help.
         joint: index of the joint that changes fastest.
         rate: the joint's rate of change, 1/s.
+        finite: whether the equations of motion gave only finite values.
     """
 
-    def __init__(self, *, too_fine: bool, joint: int, rate: float) -> None:
+    def __init__(self, *, too_fine: bool, joint: int, rate: float, finite: bool) -> None:
         super().__init__(f"joint {joint} changes at a rate of {rate:g} 1/s")
-        self.too_fine, self.joint, self.rate = too_fine, joint, rate
+        self.too_fine, self.joint, self.rate, self.finite = too_fine, joint, rate, finite
 
 
 def fastest_joint(acceleration: Callable[[list[float]], Sequence[float]], y: list[float]) -> tuple[int, float]:
@@ -194,12 +195,7 @@ class Motion:
                 step *= MIN_FACTOR if again else max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
                 if step < 10 * ulp(end):
-                    if not all(map(isfinite, chain(*K))):
-                        raise FloatingPointError(
-                            "the equations of motion gave a value that is not finite:"
-                            " inputs, payload or speeds are too large"
-                        )
-                    raise self._too_fast(y, too_fine=True)
+                    raise self._too_fast(y, too_fine=True, finite=all(map(isfinite, chain(*K))))
         return t, y, events.Event()
 
     def _limiting_rate(self, y: State, K: list[State], step: float, left: float) -> float:
@@ -233,9 +229,9 @@ class Motion:
         found = self._first_event(y, y_new, step, K, HEUN)
         return (left, y_new, events.Event()) if found is None and hold_ends and step == left else found
 
-    def _too_fast(self, y: State, *, too_fine: bool) -> StepError:
+    def _too_fast(self, y: State, *, too_fine: bool, finite: bool = True) -> StepError:
         joint, rate = fastest_joint(lambda at: self.acceleration(at)[0], y)
-        return StepError(too_fine=too_fine, joint=joint, rate=rate)
+        return StepError(too_fine=too_fine, joint=joint, rate=rate, finite=finite)
 
     def _first_event(
         self, y: State, y_new: State, step: float, K: list[State], weights: Array
