@@ -206,7 +206,7 @@ def test_causes_that_keep_the_error_only_together_are_all_named(fmus: dict[str, 
 
 def test_what_follows_from_degrees_is_a_note(fmus: dict[str, Path]) -> None:
     lines = twodof.simulate(fmus["joint"], settings={"q_des": (90.0, 0.8)}).verdict.lines
-    assert "90° is 1.571 rad (read as degrees: 0.00174 rad)" in lines[0]
+    assert "q_des[1] is 90 rad (read as degrees: 0.00174 rad); did you mean 90°, which is 1.5708 rad?" in lines[0]
     assert lines[1].startswith("note: joint 'joint1' stood at its upper limit")
     both = twodof.simulate(fmus["joint"], settings={"q_des": (45.0, 40.0)}).verdict.lines
     assert "45° is 0.7854 rad" in both[0] and not any(line.startswith("also joint") for line in both)

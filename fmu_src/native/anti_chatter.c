@@ -72,9 +72,9 @@ static double longest_hold(AntiChatter *chatter, const Step *step, double t)
     return longest;
 }
 
-/* Hold the joints that chatter at t, and set `kept` for all joints that are held. A repeated hold of HOLD_OF_ALL
+/* Hold the joints that chatter at t, and set `on_hold` for all joints that are held. A repeated hold of HOLD_OF_ALL
    or longer covers all joints at limits. Return the time at which the first hold ends, at most h. */
-static double hold_joints(AntiChatter *chatter, const Step *step, double t, double h, int kept[N_JOINTS])
+static double hold_joints(AntiChatter *chatter, const Step *step, double t, double h, int on_hold[N_JOINTS])
 {
     double end = chatter->rank.until > t ? fmin(h, chatter->rank.until) : h;
     int any = 0;
@@ -90,7 +90,7 @@ static double hold_joints(AntiChatter *chatter, const Step *step, double t, doub
     if (chatter->joints.until > t)
         end = fmin(end, chatter->joints.until);
     for (int i = 0; i < N_JOINTS; i++) {
-        kept[i] = chatter->joints_held[i] || chatter->stuck[i].until > t;
+        on_hold[i] = chatter->joints_held[i] || chatter->stuck[i].until > t;
         end = chatter->stuck[i].until > t ? fmin(end, chatter->stuck[i].until) : end;
     }
     return end;

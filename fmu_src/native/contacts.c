@@ -20,14 +20,14 @@ static int has_no_range(const Plant *plant, int i)
     return plant->value[Q_MIN + i] == plant->value[Q_MAX + i];
 }
 
-/* Find the joints at limits; stops of joints without a range, and of those in kept, act in both directions. */
-static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int kept[N_JOINTS],
+/* Find the joints at limits; stops of joints without a range, and of those in on_hold, act in both directions. */
+static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int on_hold[N_JOINTS],
                           Contact contact[N_JOINTS])
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     for (int i = 0; i < N_JOINTS; i++) {
         const double side = q[i] >= high[i] ? -1.0 : q[i] <= low[i] ? 1.0 : 0.0;
-        const Contact own = {.there = side != 0.0, .fixed = kept[i] || has_no_range(plant, i), .side = side,
+        const Contact own = {.there = side != 0.0, .fixed = on_hold[i] || has_no_range(plant, i), .side = side,
                              .low = side < 0.0 ? -HUGE_VAL : 0.0, .high = side > 0.0 ? HUGE_VAL : 0.0};
         contact[i] = own;
     }

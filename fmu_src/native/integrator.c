@@ -35,12 +35,12 @@ static const double WINDOW = 1.0 / 64.0;
 static const double SHORT = 0.25, LONGER = 1024.0;
 
 /* Determine the regime at y, where joints may rest. */
-static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
+static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int on_hold[N_JOINTS], int rank_held)
 {
     const double *value = step->plant->value;
     const int hits = impact(step->plant, step->y, anti_chatter) && value[RIGID_STOPS] != 0.0;
     step->evaluations++;
-    find_regime(step->plant, step->y, kept, rank_held ? step->stops.rank : ANY_RANK,
+    find_regime(step->plant, step->y, on_hold, rank_held ? step->stops.rank : ANY_RANK,
                 hits ? WINDOW * value[MAX_STEP] * coarseness(step->plant) : 0.0, &step->stops,
                 step->K[0] + N_JOINTS, step->effort[0], &step->margin);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
@@ -207,7 +207,7 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
 {
     if (IS_CONTROLLER)
         return 1;
-    int kept[N_JOINTS];
+    int on_hold[N_JOINTS];
     Event event;
     AntiChatter chatter;
     Step step;
@@ -223,8 +223,8 @@ static int advance_plant(Plant *plant, double h, long *evaluations, double stopp
         stopped_at[i] = HUGE_VAL;
     while (t < h && step.evaluations <= BUDGET) {
         const int before = step.stops.rank, rank_held = chatter.rank.until > t;
-        const double end = hold_joints(&chatter, &step, t, h, kept);
-        set_out(&step, chatter.joints_held, kept, rank_held);
+        const double end = hold_joints(&chatter, &step, t, h, on_hold);
+        set_out(&step, chatter.joints_held, on_hold, rank_held);
         find_departures(&chatter, &step, t);
         memset(&event, 0, sizeof event);
         step.crossed |= t > 0.0 && step.stops.rank != before;

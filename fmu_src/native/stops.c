@@ -107,14 +107,14 @@ INTERNAL int impact(const Plant *plant, double y[N_STATES], const int anti_chatt
 /* Stop the joints that move at y, with the accelerations a, until friction or a rigid stop ends their motion within a
    window, s, which may be 0, and within the tolerance of their positions. Returns whether there are any. */
 static int stop_within(const Plant *plant, double window, double y[N_STATES], const double a[N_JOINTS],
-                       const int slip[N_JOINTS], const int kept[N_JOINTS])
+                       const int slip[N_JOINTS], const int on_hold[N_JOINTS])
 {
     Contact contact[N_JOINTS];
     double rate[N_JOINTS], impulse[N_JOINTS], *v = y + N_JOINTS;
     int rests[N_JOINTS], any = 0, stops = 0;
     if (window == 0.0)
         return 0;
-    find_contacts(plant, y, kept, contact);
+    find_contacts(plant, y, on_hold, contact);
     for (int i = 0; i < N_JOINTS; i++) {
         Contact *own = &contact[i];
         const double friction = window * plant->value[FRICTION + i];
@@ -134,7 +134,7 @@ static int stop_within(const Plant *plant, double window, double y[N_STATES], co
     }
     if (!stops)
         return 0;
-    find_contacts(plant, y, kept, contact); /* of impacts that follow, in which these joints rest */
+    find_contacts(plant, y, on_hold, contact); /* of impacts that follow, in which these joints rest */
     for (int i = 0; i < N_JOINTS; i++) {
         contact[i].there |= rests[i];
         contact[i].fixed |= rests[i];
@@ -179,10 +179,10 @@ static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *
 }
 
 /* Find the regime at y after an impact, with the given rank of J⁺. a receives q̈ in this regime, effort the result of
-   restrain, margin that of acceleration. Resting joints in kept stay at rest even if the holding effort exceeds its
+   restrain, margin that of acceleration. Resting joints in on_hold stay at rest even if the holding effort exceeds its
    bounds. Joints whose motion friction or a rigid stop ends within a window, s, stop at once: the window is that of an
    impact, and otherwise 0. */
-INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS], int rank, double window,
+INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int on_hold[N_JOINTS], int rank, double window,
                           Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
@@ -196,11 +196,11 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
         stops->any_slip |= stops->slip[i] != 0;
     }
     stops->rank = acceleration(plant, y, v, slip_of(stops), rank, a, margin);
-    if (stop_within(plant, window, y, a, stops->slip, kept)) {
-        find_regime(plant, y, kept, rank, 0.0, stops, a, effort, margin);
+    if (stop_within(plant, window, y, a, stops->slip, on_hold)) {
+        find_regime(plant, y, on_hold, rank, 0.0, stops, a, effort, margin);
         return;
     }
-    find_contacts(plant, y, kept, contact);
+    find_contacts(plant, y, on_hold, contact);
     if (!add_friction(plant, v, contact))
         return;
     for (int i = 0; i < N_JOINTS; i++)
@@ -217,7 +217,7 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
         const Contact *own = &contact[i];
         const int rests = own->there && stopped[i] == 0.0;
         const int clamps = !rigid && own->side != 0.0 && v[i] == 0.0 && !rests;
-        if (clamps && (kept[i] || has_no_range(plant, i) || own->side * stopped[i] <= 0.0))
+        if (clamps && (on_hold[i] || has_no_range(plant, i) || own->side * stopped[i] <= 0.0))
             stops->held[i] = CLAMPED;
         else if (rests)
             stops->held[i] = own->side != 0.0 && rigid ? STOPPED : STUCK;
@@ -227,7 +227,7 @@ INTERNAL void find_regime(const Plant *plant, double y[N_STATES], const int kept
         }
         stops->any_slip |= stops->slip[i] != 0;
         const int acts_alike = rigid || (stops->held[i] == CLAMPED && !stops->slip[i]); /* whatever the efforts are */
-        stops->watched[i] = stops->held[i] && !kept[i] && !(has_no_range(plant, i) && acts_alike);
+        stops->watched[i] = stops->held[i] && !on_hold[i] && !(has_no_range(plant, i) && acts_alike);
         stops->any_held |= stops->held[i] != FREE;
         stops->any_watched |= stops->watched[i];
     }

@@ -14,7 +14,7 @@
    with respect to q and v, and δJᵀ y with respect to q. */
 typedef struct {
     double by_q[N_ROWS][N_JOINTS], by_v[N_ROWS][N_JOINTS];
-    Matrix turned;
+    Matrix rotated;
 } TaskSlopes;
 
 /* sum += a × b. */
@@ -81,11 +81,11 @@ static void add_rows(const double value[N_VARIABLES], const double error[3], con
         slopes->by_v[r][LEADER[i]] -= Kd * s[k] + by_v[k];
     }
 #if N_ROWS > N_AXES
-    double turned[3];
-    error_slope(error, s, turned);
+    double rotated[3];
+    error_slope(error, s, rotated);
     for (int k = 0; k < 3; k++) {
         const double Kd = value[KD_ROT + k];
-        slopes->by_q[N_AXES + k][LEADER[i]] -= Kd * moved[k] - value[KP_ROT + k] * turned[k] + by_q[k];
+        slopes->by_q[N_AXES + k][LEADER[i]] -= Kd * moved[k] - value[KP_ROT + k] * rotated[k] + by_q[k];
         slopes->by_v[N_AXES + k][LEADER[i]] -= Kd * s[k] + by_v[k];
     }
 #else
@@ -95,14 +95,15 @@ static void add_rows(const double value[N_VARIABLES], const double error[3], con
 
 /* Add δJᵀ y with respect to q: joint j rotates the columns of J of the joints i after it, and moves the task frame for
    those before it. y has angular and linear components in the root's axes. */
-static void add_turned(const JointMotion motion[N_BODIES], const double y[6], Matrix turned)
+static void add_rotated(const JointMotion motion[N_BODIES], const double y[6], Matrix rotated)
 {
-    add_force(&y[3], motion, turned);
+    add_force(&y[3], motion, rotated);
     for (int j = END_BODY; j >= 0 && N_ROWS > N_AXES; j = PARENT[j]) {
         double moment[3];
         cross(y, motion[j].s, moment);
         for (int i = END_BODY; i > j; i = PARENT[i])
-            turned[LEADER[i]][LEADER[j]] += moment[0] * motion[i].s[0] + moment[1] * motion[i].s[1] + moment[2] * motion[i].s[2];
+            rotated[LEADER[i]][LEADER[j]] +=
+                moment[0] * motion[i].s[0] + moment[1] * motion[i].s[1] + moment[2] * motion[i].s[2];
     }
 }
 
@@ -141,11 +142,11 @@ static int add_command_by_states(const double value[N_VARIABLES], const JointPos
     move_end(&value[V], given, motion, velocity, acceleration);
     for (int i = END_BODY; i >= 0; i = PARENT[i])
         add_rows(value, error, &motion[i], velocity, acceleration, i, &slopes);
-    add_turned(motion, y, slopes.turned);
+    add_rotated(motion, y, slopes.rotated);
     for (int r = 0; r < N_ROWS; r++)
         for (int k = 0; k < N_JOINTS; k++) {
             for (int c = 0; c < N_JOINTS; c++)
-                slopes.by_q[r][c] -= task.J[r][k] * slopes.turned[k][c];
+                slopes.by_q[r][c] -= task.J[r][k] * slopes.rotated[k][c];
             slopes.by_v[r][k] += Kn * task.J[r][k];
         }
     for (int i = 0; i < N_JOINTS; i++) {
@@ -160,7 +161,7 @@ static int add_command_by_states(const double value[N_VARIABLES], const JointPos
                 slope[V + c][i] += inverse[r][i] * slopes.by_v[r][c];
             }
         for (int i = 0; i < N_JOINTS; i++)
-            slope[Q + c][i] += slopes.turned[i][c];
+            slope[Q + c][i] += slopes.rotated[i][c];
         slope[V + c][c] -= Kn;
     }
     return 1;

@@ -12,8 +12,9 @@ export function spectralRadius(Kp, Kd, period, delay, differences) {
   const over = delay - Math.floor(delay / period) * period, whole = Math.floor(delay / period) + Number(period - over < 1e-9);
   const part = delay - whole * period, rest = period - part, n = 4 + whole;
   const A = Array.from({ length: n }, () => Array(n).fill(0));
-  const place = Number(Kp !== 0), gains = differences ? [-Kp - Kd / period, 0, (place * Kd) / period] : [-Kp, -Kd, 0];
-  A[0].splice(0, 2, place, period);
+  const hasPosition = Number(Kp !== 0);
+  const gains = differences ? [-Kp - Kd / period, 0, (hasPosition * Kd) / period] : [-Kp, -Kd, 0];
+  A[0].splice(0, 2, hasPosition, period);
   A[1][1] = 1;
   const ways = [(part * rest + part * part / 2), part], next = [rest * rest / 2, rest];
   for (const i of [0, 1]) {

@@ -37,7 +37,7 @@ class System(Fmu):
         batches: outputs and inputs in the order of evaluation at one instant.
         initial: outputs and inputs in the order of evaluation in initialisation mode.
         recorded: name of the component that is the robot.
-        places: the component's variable, or the system's connector, for each of ``variables``.
+        nodes: the component's variable, or the system's connector, for each of ``variables``.
         bound: start values of components' variables from parameter bindings, also of connectors that pass them.
     """
 
@@ -46,7 +46,7 @@ class System(Fmu):
     links: tuple[Link, ...] = ()
     batches: tuple[tuple[Node, ...], ...] = ()
     initial: tuple[tuple[Node, ...], ...] = ()
-    places: Mapping[str, Node] = field(default_factory=dict)
+    nodes: Mapping[str, Node] = field(default_factory=dict)
     bound: Mapping[Node, Start] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -64,7 +64,7 @@ class System(Fmu):
         given = {name.partition("[")[0] for name in asked}
         for group in sorted(given & known):
             others = [full for name in self.components if (full := f"{name}.{group}") in known - given]
-            if others and self.places[self.vector(group)[0]].element == self.recorded:
+            if others and self.nodes[self.vector(group)[0]].element == self.recorded:
                 lines.append(f"{group} is set in '{self.recorded}' alone: {', '.join(others)} keeps its value")
         return lines
 
@@ -131,14 +131,14 @@ def load_system(path: Path, robot: str = "") -> System:
     chosen = _robot(path, fmus, robot)
     starts = _bound(path, wiring)
     numbers = {node: value for node, value in starts.items() if not isinstance(value, str)}
-    variables, places = _variables(path, wiring, fmus, links, numbers, chosen, _measuring(fmus, links, chosen))
+    variables, nodes = _variables(path, wiring, fmus, links, numbers, chosen, _measuring(fmus, links, chosen))
     digest = hashlib.sha256(structure)
     for fmu in by_source.values():
         digest.update(f"{fmu.guid} {sorted(fmu.members.items())}\0".encode())
     description = copy(fmus[chosen].description)
     description.modelName, description.guid, description.defaultExperiment = title, digest.hexdigest(), times
     aliases: dict[str, str] = {}
-    for name, node in places.items():
+    for name, node in nodes.items():
         if (full := str(node)) != name and node.element:
             aliases |= {full: name, full.rpartition("[")[0] or full: name.rpartition("[")[0] or name}
     own = dict(variables=variables, description=description, control="", aliases=aliases)
@@ -149,7 +149,7 @@ def load_system(path: Path, robot: str = "") -> System:
         links=tuple(links),
         batches=batches,
         initial=initial,
-        places=places,
+        nodes=nodes,
         bound={node: value for node, value in starts.items() if node.element in fmus},
     )
 
@@ -240,14 +240,14 @@ def _variables(
     A connector that could be mistaken for a vector of the robot is "system.connector".
     """
     variables: dict[str, Scalar] = {}
-    places: dict[str, Node] = {}
+    nodes: dict[str, Node] = {}
 
     def add(name: str, node: Node, scalar: Scalar, causality: str, start: float | bool | None) -> None:
         if name in variables:
-            raise FmuError(f"'{path}' has two variables '{name}', '{node}' and '{places[name]}'")
+            raise FmuError(f"'{path}' has two variables '{name}', '{node}' and '{nodes[name]}'")
         text = None if start is None else str(start).lower() if isinstance(start, bool) else repr(start)
         variables[name] = replace(scalar, name=name, causality=causality, start=text)
-        places[name] = node
+        nodes[name] = node
 
     driving = _driving(links, robot)
     driven: dict[Node, list[Link]] = {}
@@ -284,7 +284,7 @@ def _variables(
                 start = starts.get(node, scalar.start_value)
                 causality = "local" if node in ends else scalar.causality
                 add(scalar.name if own else str(node), node, scalar, causality, start)
-    return variables, places
+    return variables, nodes
 
 
 def _is_plain(wiring: Wiring, node: Node, scalar: Scalar, driving: set[str]) -> bool:

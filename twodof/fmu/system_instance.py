@@ -80,7 +80,7 @@ class SystemInstance:
         """Return values by component and its variable's name; a connector's value goes to the connected variables."""
         own: dict[str, dict[str, float | bool | str]] = {}
         for name, value in values.items():
-            node = self._system.places[name]
+            node = self._system.nodes[name]
             ends = [(link.target, link.map) for link in self._outer.get(node, [])] or [(node, IDENTITY)]
             for target, affine in ends:
                 own.setdefault(target.element, {})[target.connector] = (
@@ -113,13 +113,13 @@ class SystemInstance:
         """Return the calls of one step that C can make, the last of which read Real variables into rows."""
         calls = [(element, call) for element, _, call in [*self._steps, *self._moves]]
         for element, first, own in self._columns(names):
-            place = address + first * sizeof(c_double)
-            calls.append((element, self._instances[element].prepared(own, place, len(names))))
+            target = address + first * sizeof(c_double)
+            calls.append((element, self._instances[element].prepared(own, target, len(names))))
         return [(element, self._instances[element], call) for element, call in calls]
 
     def _columns(self, names: Sequence[str]) -> Iterator[tuple[str, int, list[str]]]:
         """Yield components, the index of the first of their variables, and the variables' names there."""
-        nodes, first = [self._system.places[name] for name in names], 0
+        nodes, first = [self._system.nodes[name] for name in names], 0
         for element, group in groupby(nodes, key=lambda node: node.element):
             own = [node.connector for node in group]
             yield element, first, own

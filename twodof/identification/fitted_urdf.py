@@ -9,7 +9,7 @@ import lxml.etree
 import numpy as np
 
 from ..errors import InputError
-from ..plant.robot import inertial_place
+from ..plant.robot import inertial_pose
 from ..plant.urdf import INERTIA, Urdf
 from .inertials import inertia_of
 from .parameters import Parameters, Values
@@ -36,15 +36,15 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     for free in parameters.free:
         if free.group in OF_DYNAMICS:
-            leader = parameters.robot.joints[free.place]
-            before, after = (float(getattr(v, free.group)[free.place]) for v in (parameters.start, values))
+            leader = parameters.robot.joints[free.number]
+            before, after = (float(getattr(v, free.group)[free.number]) for v in (parameters.start, values))
             for joint in (joint for joint in urdf.joints.values() if joint.leader == leader):
                 own = getattr(joint, free.group)
                 share = own * after / before if before else after * (joint.name == leader)
                 if joint.moves and (share or own):
                     _child(joints[joint.name], "dynamics").set(free.group, _number(share))
         elif free.group in ("mass", "com", "inertia"):
-            _write_link(links[parameters.links[free.place]].find("inertial"), free.group, free.place, values)
+            _write_link(links[parameters.links[free.number]].find("inertial"), free.group, free.number, values)
     declaration = re.match(r"\ufeff?<\?xml.*?\?>\s*", text, re.DOTALL)
     written = lxml.etree.tostring(tree, encoding="unicode")
     return f"{declaration[0] if declaration else ''}{written.rstrip()}\n".encode()
@@ -64,7 +64,7 @@ def parsed(text: str) -> lxml.etree.ElementTree:
 
 
 def _write_link(inertial: lxml.etree.Element, group: str, link: int, values: Values) -> None:
-    place = inertial_place(inertial)
+    place = inertial_pose(inertial)
     if group == "mass":
         inertial.find("mass").set("value", _number(values.mass[link]))
     elif group == "com":

@@ -113,7 +113,7 @@ class Free(NamedTuple):
     """Free parameters of one joint or link: group, index of joint or link, names and units of the values."""
 
     group: str
-    place: int
+    number: int
     names: tuple[str, ...]
     units: tuple[str, ...]
 
@@ -125,7 +125,7 @@ class Free(NamedTuple):
     def of(self, values: Values) -> Numbers:
         """Return a view of its values; for an inertia, of the second moments of mass."""
         whole: Numbers = getattr(values, "second" if self.group == "inertia" else self.group)
-        return whole if self.group in OF_THE_ROBOT else whole[self.place, ...]
+        return whole if self.group in OF_THE_ROBOT else whole[self.number, ...]
 
 
 class Parameters:
@@ -196,7 +196,7 @@ class Parameters:
     @property
     def varying(self) -> NDArray[np.int64]:
         """Indices of the inertial parameters of the bodies that the free parameters change."""
-        bodies = {self.bodies[free.place] for free in self.free if free.group in ("mass", "com", "inertia")}
+        bodies = {self.bodies[free.number] for free in self.free if free.group in ("mass", "com", "inertia")}
         if any(free.group in ("payload", "payload_com") for free in self.free):
             bodies.add(self._end[0])
         return np.array([10 * body + k for body in sorted(bodies - {-1}) for k in range(10)], np.int64)
@@ -238,9 +238,9 @@ class Parameters:
             start.payload[:] = max(float(start.payload[0]), LEAST_PAYLOAD * moving)
         for free in self.free:
             if free.group == "inertia":
-                values, vectors = np.linalg.eigh(start.second[free.place])
-                least = LEAST_MOMENT * 0.05**2 * max(start.mass[free.place], 1e-3 * moving)
-                start.second[free.place] = (vectors * np.maximum(values, least)) @ vectors.T
+                values, vectors = np.linalg.eigh(start.second[free.number])
+                least = LEAST_MOMENT * 0.05**2 * max(start.mass[free.number], 1e-3 * moving)
+                start.second[free.number] = (vectors * np.maximum(values, least)) @ vectors.T
 
     def coordinates(self, typical: Mapping[str, Array]) -> tuple[Array, Array, Array]:
         """Return the coordinates of the start values, their lower bounds, and their scales.
@@ -270,7 +270,7 @@ class Parameters:
             return np.where(ROWS == COLUMNS, 1.0, np.sqrt(np.trace(free.of(self.start))))
         if free.group == "payload":
             return np.array([self.start.mass.sum()])
-        own = SCALES[free.group] if free.group in SCALES else typical[free.group][free.place]
+        own = SCALES[free.group] if free.group in SCALES else typical[free.group][free.number]
         return np.full(free.size, float(own))
 
     def values(self, x: Numbers) -> Values:
@@ -337,7 +337,7 @@ class Parameters:
                 if free.group in Dynamics._fields:
                     getattr(rates, free.group)[..., k] = getattr(values, free.group).imag / step
                     continue
-                body, ten = self._ten(values, None if free.group in OF_THE_ROBOT else free.place)
+                body, ten = self._ten(values, None if free.group in OF_THE_ROBOT else free.number)
                 if body >= 0:
                     rates.inertial[10 * body : 10 * body + 10, k] = ten.imag / step
             own[...] = before

@@ -92,8 +92,8 @@ def _regimes(motion: Motion, y: State, h: float) -> State:
             anti_chatter = [False] * n
         rank, rank_held = motion.rank, slide.until > t
         end = min((hold.until for hold in (joint_hold, slide, *stuck) if hold.until > t), default=h)
-        kept = [chatters or hold.until > t for chatters, hold in zip(anti_chatter, stuck)]
-        rates = motion.set_out(y, anti_chatter, kept, rank_held)
+        on_hold = [chatters or hold.until > t for chatters, hold in zip(anti_chatter, stuck)]
+        rates = motion.set_out(y, anti_chatter, on_hold, rank_held)
         for i, at_limit in enumerate(stops.at_limits(y)):
             if at_limit and i not in stops.held:
                 left[i] = t

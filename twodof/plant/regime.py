@@ -100,13 +100,13 @@ class Motion:
         self._grip_rates: dict[int, list[float]] = {}  # at the end of the last regime, per s
         self.margins: list[float] = []
 
-    def set_out(self, y: State, anti_chatter: Sequence[bool], kept: Sequence[bool], rank_held: bool) -> State:
+    def set_out(self, y: State, anti_chatter: Sequence[bool], on_hold: Sequence[bool], rank_held: bool) -> State:
         """Apply an impact and determine the regime after it; return ẏ in it.
 
         Args:
             y: the state (q, v); changed.
             anti_chatter: joints that stop in both directions.
-            kept: joints that stay at rest even if the holding effort exceeds its bounds.
+            on_hold: joints that stay at rest even if the holding effort exceeds its bounds.
             rank_held: whether the rank stays as it is.
         """
         self.rank_held, rank = rank_held, self.rank if rank_held else None
@@ -114,10 +114,10 @@ class Motion:
         self.stops.slide(y[self.n :])
         a, self.rank, margin = self._acceleration(y, rank)
         window = events.WINDOW * self.max_step * self.coarseness
-        if hits and self.stops.stop_within(window, y, a, kept, self.tolerance):
+        if hits and self.stops.stop_within(window, y, a, on_hold, self.tolerance):
             self.stops.slide(y[self.n :])
             a, self.rank, margin = self._acceleration(y, rank)
-        self.grips, self.margins = [self.stops.hold(y, a, kept)], [margin]
+        self.grips, self.margins = [self.stops.hold(y, a, on_hold)], [margin]
         return y[self.n :] + a
 
     def acceleration(self, y: State) -> tuple[list[float], list[float], float]:

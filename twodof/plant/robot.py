@@ -147,7 +147,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
 
 def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], list[pin.SE3], list[pin.Inertia]]:
     """Return the moving links with mass: names, bodies, poses in these, and inertias in the links' frames."""
-    names, bodies, places, inertias = [], [], [], []
+    names, bodies, poses, inertias = [], [], [], []
     for element in urdf.tree.findall("link"):
         name = str(element.get("name"))
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
@@ -161,15 +161,15 @@ def moving_links(urdf: Urdf, model: pin.Model) -> tuple[list[str], list[int], li
         about = np.empty((3, 3))
         for key, (row, column) in INERTIA.items():
             about[row, column] = about[column, row] = float(tensor.get(key, 0.0))
-        place = inertial_place(inertial)
+        pose = inertial_pose(inertial)
         names.append(name)
         bodies.append(frame.parentJoint - 1)
-        places.append(frame.placement)
-        inertias.append(place.act(pin.Inertia(float(mass.get("value", 0.0)), np.zeros(3), about)))
-    return names, bodies, places, inertias
+        poses.append(frame.placement)
+        inertias.append(pose.act(pin.Inertia(float(mass.get("value", 0.0)), np.zeros(3), about)))
+    return names, bodies, poses, inertias
 
 
-def inertial_place(inertial: ET.Element) -> pin.SE3:
+def inertial_pose(inertial: ET.Element) -> pin.SE3:
     """Return the pose of an <inertial> element's frame in its link's frame."""
     origin = inertial.find("origin")
     xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))

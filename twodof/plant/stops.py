@@ -108,7 +108,7 @@ class Stops:
         window: float,
         y: list[float],
         a: Sequence[float],
-        kept: Sequence[bool],
+        on_hold: Sequence[bool],
         tolerance: Callable[[float], float],
     ) -> bool:
         """Stop joints whose motion friction or a rigid stop ends within a window; return whether there are any.
@@ -117,7 +117,7 @@ class Stops:
             window: s, > 0.
             y: the state (q, v) after an impact; changed.
             a: q̈ in the directions of ``slide``.
-            kept: joints at limits that stop in both directions.
+            on_hold: joints at limits that stop in both directions.
             tolerance: tolerance of a position, which the motion in the window must not exceed.
         """
         n, sides = len(self.limits), self._sides(y)
@@ -129,12 +129,12 @@ class Stops:
         if not any(rates[i] * v[i] < 0.0 for i in bounds):
             return False
         W = self._inverse_mass(y[:n])
-        fixed = [i for i in bounds if (kept[i] or self._has_no_range(i)) and (i in sides or v[i] == 0.0)]
+        fixed = [i for i in bounds if (on_hold[i] or self._has_no_range(i)) and (i in sides or v[i] == 0.0)]
         _, at = _complementary(W, rates, bounds, fixed, window * self._largest_effort(y, a))
         resting = [i for i, state in at.items() if state == 0]
         if not v[resting].any():
             return False
-        locked = {i for i in sides if kept[i] or self._has_no_range(i)}
+        locked = {i for i in sides if on_hold[i] or self._has_no_range(i)}
         self._collide(y, W, sides, locked | {*resting})
         return True
 
@@ -143,7 +143,7 @@ class Stops:
         self.slip = [int(x > 0.0) - int(x < 0.0) if F else 0 for x, F in zip(v, self._friction)]
         return self.slip
 
-    def hold(self, y: Sequence[float], a: list[float], kept: Sequence[bool]) -> list[float]:
+    def hold(self, y: Sequence[float], a: list[float], on_hold: Sequence[bool]) -> list[float]:
         """Find the joints that rest at (q, v) after an impact, and the directions in which others begin to slip.
 
         Return the same as ``restrain``.
@@ -151,15 +151,15 @@ class Stops:
         Args:
             y: the state.
             a: q̈ with joints at rest free, and slip in the directions of ``slide``; changed to q̈ with joints held.
-            kept: joints that stay at rest even if the holding effort exceeds its bounds.
+            on_hold: joints that stay at rest even if the holding effort exceeds its bounds.
         """
         n = len(self.limits)
         sides = self._sides(y)
-        locked = [i for i in range(n) if kept[i] or self._has_no_range(i)]
+        locked = [i for i in range(n) if on_hold[i] or self._has_no_range(i)]
         clamps = {i for i in sides if y[n + i] == 0.0 and not self.rigid}
         bounds = {}
         for i in range(n):
-            briefly = i in clamps and kept[i] and not self._has_no_range(i)
+            briefly = i in clamps and on_hold[i] and not self._has_no_range(i)
             friction = 0.0 if briefly else self._friction[i]
             if y[n + i] == 0.0 and (friction or (i in sides and self.rigid)):
                 side = sides.get(i, 0.0) if self.rigid else 0.0
@@ -183,7 +183,7 @@ class Stops:
         if begun:
             a[:] = (W @ [-self._friction[i] * begun.get(i, 0) for i in range(n)] + a).tolist()
         self.held = [i for i, rest in enumerate(self.rest) if rest]
-        self.watched = [i for i in self.held if not kept[i] and not (self._has_no_range(i) and self._stays(i))]
+        self.watched = [i for i in self.held if not on_hold[i] and not (self._has_no_range(i) and self._stays(i))]
         return self.restrain(y, a)
 
     def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:
