@@ -95,7 +95,8 @@ def _grouped(why: tuple[Cause, ...], count: int, worst: str) -> list[Cause]:
             joints = dict.fromkeys(other.joint for other in same if other.joint != lead.joint)
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
             names = "all other joints" if len(joints) == count - 1 > 1 else names
-            grouped.append(lead._replace(text=lead.text + f"; likewise {names}" * bool(names)))
+            question = "?" * lead.text.endswith("?")
+            grouped.append(lead._replace(text=lead.text.rstrip("?") + f"; likewise {names}" * bool(names) + question))
     first = {cause.tried: cause for cause in reversed(grouped)}
     return [c if not c.tried or first[c.tried] is c else c._replace(tried="", part=None) for c in grouped]
 
