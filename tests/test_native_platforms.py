@@ -441,7 +441,7 @@ def test_a_missing_compiler_is_named(platform, reason, tmp_path, without_zig, mo
         monkeypatch.setenv("PATH", str(tmp_path))
     message = refused(tmp_path, platform)
     assert f"cannot compile for {platform}: {reason}" in message
-    assert "install the package 'ziglang'" in message
+    assert "install the extra 'native': " in message
 
 
 @needs_linux
