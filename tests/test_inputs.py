@@ -164,7 +164,7 @@ BAD_TABLES = {
     "Arabic digits": ("time,Kn\n0,١\n", "row 2: Kn = '١' is not a number"),
     "empty cell": ("time,Kn\n0,\n", "row 2: Kn = '' is not a number"),
     "two columns of one name": ("time,Kn,Kn\n0,1,1\n", "two columns for 'Kn'"),
-    "parameter": ("time,rtol\n0,1\n", "rtol is a parameter, which is set before a run"),
+    "parameter": ("time,rtol\n0,1\n", "rtol is a parameter, which cannot change during a run"),
     "output": ("time,q[1]\n0,1\n", r"q\[1\] is not an input"),
     "no rows": ("time,Kn\n", "has no rows|is empty"),
     "cell over two lines": ('time,Kn\n0,"1\n1"\n', "row 3: 1 cells, expected 2"),
