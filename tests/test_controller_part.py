@@ -237,6 +237,27 @@ def test_a_payload_that_only_the_controller_has_is_named(ssp: Path) -> None:
     assert cured.outcome == "reached" and not cured.causes
 
 
+@pytest.mark.parametrize(
+    ("step", "period", "delay", "late"),
+    [
+        (0.01, 0.02, 0.01, ""),
+        (0.01, 0.0, 0.0, ""),
+        (0.001, 0.007, 0.003, ""),
+        (0.015, 0.02, 0.0, "pd.control_period = 0.02 s"),
+        (0.02, 0.01, 0.0, "pd.control_period = 0.01 s"),
+        (0.01, 0.02, 0.005, "pd.control_delay = 0.005 s"),
+    ],
+)
+def test_times_of_a_controller_between_steps_are_warned_of(
+    fmus: dict[str, Path], caplog: pytest.LogCaptureFixture, step: float, period: float, delay: float, late: str
+) -> None:
+    """Plant and controller exchange signals at communication points alone: up to 0.03 rad from the whole robot."""
+    settings = {"pd.control_period": period, "pd.control_delay": delay}
+    twodof.experiment(fmus["joint split"], step=step, stop_time=0.6, settings=settings)
+    texts = [text for text in caplog.messages if "whole number of communication steps" in text]
+    assert [text.partition(" is not")[0] for text in texts] == [late] * bool(late)
+
+
 def test_a_split_robot_measures_what_its_controller_sees(ssp: Path, tmp_path: Path) -> None:
     settings: dict[str, Any] = {"controller.q_noise": 0.01, "controller.q_resolution": 0.02}
     samples = list(twodof.samples(ssp, stop_time=0.2, settings=settings, signals=True))
@@ -264,12 +285,12 @@ def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None
     known = "controller.payload_known=true and controller.payload=0.1", "payload_known=true"
     assert lines.replace(*known) == str(twodof.simulate(whole, settings=TARGETS["task"]).verdict)
     late = {**TARGETS["task"], "Kp": 342.0, "Kd": 30.8}
-    delays = {"control_delay": 0.05}, {"controller.control_delay": 0.05}
+    delays = {"control_delay": 0.05}, {"pd.control_delay": 0.05}
     for fmu, delay in zip((whole, ssp), delays, strict=True):
         verdict = twodof.simulate(fmu, settings={**late, **delay}).verdict
         assert verdict.causes[0].kind == "unstable" and "control_delay = 0.05 s" in verdict.causes[0].text
     starts = twodof.load_fmu(ssp).start_values
-    assert (starts["controller.control_period"], starts["control_period"]) == (0.01, 0.0)
+    assert (starts["pd.control_period"], starts["control_period"]) == (0.01, 0.0)
     assert (starts["controller.payload"], starts["payload"], starts["rigid_stops"]) == (0.1, 0.1, False)
 
 

@@ -395,6 +395,9 @@ def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
     ("name", "old", "new", "text"),
     [
         ("push-ref.csv", b"0.01,", b"0.01,x", "could not convert"),
+        ("push-ref.csv", b"\n0.01,", b"\n-0.01,", "it has results at -0.01 s, before its start"),
+        ("references.exp", b'tolerance="1e-10"', b'tolerance="inf"', "its tolerance inf is not finite and >= 0"),
+        ("references.exp", b'tolerance="1e-10"', b'tolerance="-1"', "its tolerance -1 is not finite and >= 0"),
         ("push-ref.csv", b"\n0.02,", b"\n0.02,1,", "cannot be read"),
         ("push.ssv", b"ssv:Real", b"ssv:Complex", "is of type Complex, which cannot be set"),
         ("references.exp", b'"push.ssv"', b'"none.ssv"', "none.ssv"),

@@ -13,6 +13,7 @@ import posixpath
 import zipfile
 from array import array
 from collections.abc import Callable, Iterable, Mapping
+from math import inf
 from typing import NamedTuple
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
@@ -113,6 +114,10 @@ class Reference(NamedTuple):
         if index.max(initial=0) >= len(rows):
             end = f"{self.time(len(rows) - 1):g} s, the end of its run"
             raise SimulationError(f"it has results at {numbers[:, 0].max():g} s, after {end}")
+        if index.min(initial=0) < 0:
+            raise SimulationError(f"it has results at {numbers[:, 0].min():g} s, before its start")
+        if not 0.0 <= self.tolerance < inf:
+            raise SimulationError(f"its tolerance {self.tolerance:g} is not finite and >= 0")
         kept = index > 0
         expected, found = numbers[kept, 1:], rows[index[kept]]
         if not expected.size:

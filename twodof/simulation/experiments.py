@@ -150,6 +150,7 @@ def experiment(
         LOG.warning(f"'{fmu.path}': {line}")
     run.first_stamp()  # raises for a time that ROS 2 cannot express
     _report_late(run, "`changes`" if input_file is None else f"'{input_file}'")
+    _report_times_between_steps(run)
     return run
 
 
@@ -159,6 +160,23 @@ def _report_late(run: Experiment, source: str) -> None:
         LOG.warning(
             f"{source}: {late} of its times are after the run's end at {end:g} s, and their inputs are never set"
         )
+
+
+def _report_times_between_steps(run: Experiment) -> None:
+    """Warn of a controller in a system whose efforts change between communication steps."""
+    for name, value in run.start_values.items():
+        part, _, kind = name.rpartition(".")
+        steps = value / run.step
+        if (
+            kind in ("control_period", "control_delay")
+            and f"{part}.tau_cmd[1]" in run.fmu.variables
+            and run.fmu.variables[f"{part}.tau_cmd[1]"].causality == "output"
+            and abs(steps - round(steps)) > TIME_TOLERANCE
+        ):
+            LOG.warning(
+                f"{name} = {value:g} s is not a whole number of communication steps of {run.step:g} s:"
+                " the plant receives efforts later than the controller gives them"
+            )
 
 
 def _times(fmu: Fmu, start: float | None, stop: float | None, step: float | None) -> tuple[float, float, float]:
