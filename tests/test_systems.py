@@ -728,6 +728,11 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
         yield kind, system, {}, f"'word' and 'pd.{name}' are of type {kind}: not supported"
     parts = wired.replace(component("pd"), component("pd", binding(values("text Binary 00"))))
     yield "Binary value", ssd(parts), {}, r"the value of 'pd\.text', '00', is a Binary for another type: not supported"
+    negation = '><ssc:LinearTransformation factor="-1" offset="1"/></ssm:MappingEntry></ssm'
+    turned = mapping("a limit_effort").replace("/></ssm", negation, 1)
+    own = component("plant", binding(values("a Boolean true"), turned))
+    parts = wired.replace(component("plant"), own)
+    yield "Boolean value", ssd(parts), {}, r"the value of 'plant\.limit_effort' is a Boolean, which is not transformed"
     me = wired.replace("source=", 'implementation="ModelExchange" source=', 1)
     yield "Model Exchange", ssd(me), {}, "component 'plant' is a Model Exchange FMU"
     yield "version", ssd(wired).replace(b'version="1.0" name', b'version="3.0" name'), {}, "The value '3.0' is not"

@@ -209,6 +209,8 @@ def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> Star
                 f"'{path}': the value of '{node}', '{value:.80}', is a {parameter.type} {use}: not supported"
             )
         return _typed(path, node, scalar, value)
+    if isinstance(value, bool) and total != IDENTITY:
+        raise FmuError(f"'{path}': the value of '{node}' is a Boolean, which is not transformed")
     if parameter.converts:
         given, own = wiring.applied(node, parameter.unit), wiring.unit(node)
         total = total.after(conversion(path, given, own, f"'{node}' and its value"))
