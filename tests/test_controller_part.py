@@ -285,12 +285,12 @@ def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None
     known = "controller.payload_known=true and controller.payload=0.1", "payload_known=true"
     assert lines.replace(*known) == str(twodof.simulate(whole, settings=TARGETS["task"]).verdict)
     late = {**TARGETS["task"], "Kp": 342.0, "Kd": 30.8}
-    delays = {"control_delay": 0.05}, {"pd.control_delay": 0.05}
+    delays = {"control_delay": 0.05}, {"controller.control_delay": 0.05}
     for fmu, delay in zip((whole, ssp), delays, strict=True):
         verdict = twodof.simulate(fmu, settings={**late, **delay}).verdict
         assert verdict.causes[0].kind == "unstable" and "control_delay = 0.05 s" in verdict.causes[0].text
     starts = twodof.load_fmu(ssp).start_values
-    assert (starts["pd.control_period"], starts["control_period"]) == (0.01, 0.0)
+    assert (starts["controller.control_period"], starts["control_period"]) == (0.01, 0.0)
     assert (starts["controller.payload"], starts["payload"], starts["rigid_stops"]) == (0.1, 0.1, False)
 
 
