@@ -6,7 +6,7 @@ import os
 import platform
 import re
 import resource
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +35,17 @@ def print_figures(figures: Iterable[Figure]) -> None:
     print("\n| what | measured | wanted |\n| --- | --- | --- |")
     for figure in figures:
         print("| " + " | ".join(figure) + " |")
+
+
+def print_judged(rows: Iterable[tuple[Sequence[str], bool]]) -> int:
+    """Print rows in Markdown as they come, the first as the head; mark wrong ones, and return 1 if there is one."""
+    wrong = 0
+    for k, (row, right) in enumerate(rows):
+        print(f"| {' | '.join(row)} |", *(() if right else ("wrong",)), flush=True)
+        if k == 0:
+            print("|" + " --- |" * len(row))
+        wrong += not right
+    return 1 if wrong else 0
 
 
 def machine() -> str:

@@ -39,6 +39,7 @@ import fmpy
 import numpy as np
 import pinocchio as pin
 from arms import ROBOTS
+from report import print_judged
 from scipy.integrate import solve_ivp
 
 import twodof
@@ -284,14 +285,8 @@ def main() -> int:
     logging.disable(logging.WARNING)
     words = [word for word in sys.argv[1:] if word[:2] != "--"]
     rows = compared_rows if "--versions" in sys.argv else fallen_rows if "--falls" in sys.argv else built_rows
-    wrong = 0
     with tempfile.TemporaryDirectory() as folder:
-        for k, (row, right) in enumerate(rows(words, Path(folder))):
-            print(f"| {' | '.join(row)} |", flush=True)
-            if k == 0:
-                print("|" + " --- |" * len(row))
-            wrong += not right
-    return 1 if wrong else 0
+        return print_judged(rows(words, Path(folder)))
 
 
 if __name__ == "__main__":

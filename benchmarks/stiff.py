@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 from arms import ROBOTS, URDF, Arm, chain, compiled, panda, shipped_arm
-from report import machine, print_rows
+from report import machine, print_judged, print_rows
 from robots import frame_of
 from scipy.integrate import solve_ivp
 
@@ -192,7 +192,6 @@ def damped(arm: Arm, folder: Path) -> np.ndarray:
 def main() -> int:
     """Print a table; return 1 if a result is wrong."""
     print(machine(), flush=True)
-    wrong = 0
     with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
         if "--damping" in sys.argv:
             arms = {"default arm": shipped_arm(), "Panda": panda("effort"), "chain of 5": chain(5, "effort")}
@@ -200,12 +199,7 @@ def main() -> int:
             rows = [(name, *(f"{x:.1f}" for x in cost / cost[0])) for name, cost in costs.items()]
             print_rows("times of the largest step", ("damping", *(f"{D:g}" for D in DAMPING)), *rows)
             return 0
-        for k, (row, right) in enumerate(error_rows([w for w in sys.argv[1:] if w[:2] != "--"], Path(folder))):
-            print(f"| {' | '.join(row)} |", *(() if right else ("wrong",)), flush=True)
-            if k == 0:
-                print("|" + " --- |" * len(row))
-            wrong += not right
-    return 1 if wrong else 0
+        return print_judged(error_rows([w for w in sys.argv[1:] if w[:2] != "--"], Path(folder)))
 
 
 if __name__ == "__main__":
