@@ -41,7 +41,7 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: the path is not a bag, or the bag is unfinished, damaged or without joint states.
     """
-    return _read([_Robot(path_of(path, "bag"), JointStates, Targets())])[0]
+    return read_bags([path])[0]
 
 
 def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
@@ -55,7 +55,7 @@ def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], S
 
 def read_bags(paths: Sequence[str | Path], budget: ReadBudget | None = None) -> list[Recording]:
     """Read robots of one bag as ``read_bag`` does, in one pass; the budget may be that of several bags together."""
-    return _read([_Robot(Path(path), JointStates, Targets()) for path in paths], budget)
+    return _read([_Robot(path_of(path, "bag"), JointStates, Targets()) for path in paths], budget)
 
 
 def read_all_ends(paths: Sequence[Path]) -> list[Recording]:

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
-from ..bag.reader import read_bag
+from ..bag.reader import read_bags
 from ..bag.recording import Recording
+from ..bag.records import ReadBudget
+from ..bounds import MAX_SAMPLES, MIB
 from ..errors import InputError
 from ..export.fmu_options import FmuOptions
 from ..export.urdf_source import end_effector, last_links, lock_joints, read_text
@@ -175,8 +177,13 @@ def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callabl
 
 
 def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
-    """Return the recordings of bags; raise InputError if there are none, or one counts twice."""
-    recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
+    """Return the recordings of bags; raise InputError if there are none, one counts twice, or they are too large."""
+    budget, recordings, size = ReadBudget(), list[Recording](), 0
+    for bag in [bags] if isinstance(bags, str | Path) else bags:
+        recordings += read_bags([bag], budget)
+        size += sum(values.nbytes for values in (recordings[-1].q, recordings[-1].v, recordings[-1].tau))
+        if size > MAX_SAMPLES:
+            raise InputError(f"the bags to '{bag}' have over {MAX_SAMPLES // MIB} MiB of joint states; give fewer")
     if not recordings:
         raise InputError("a fit needs a bag")
     for a, b in combinations(recordings, 2):
