@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import struct
 import tracemalloc
 from dataclasses import replace
 from itertools import count
@@ -18,11 +19,13 @@ import pinocchio as pin
 import pytest
 import scipy.optimize
 import scipy.signal
+from bags import FOOTER, HEADER, channel, chunk, message, record, texts
 from motions import assert_true, bag_of, follow, move, mujoco_model, noisy
 
 import twodof
+from twodof.bag.mcap import zstd
 from twodof.cli.main import main
-from twodof.errors import InputError
+from twodof.errors import BagError, InputError
 from twodof.identification import curves as prediction_curves
 from twodof.identification import estimate as estimation
 from twodof.identification import fitting, parameters, stretches
@@ -44,6 +47,12 @@ FREE = ("friction[*]", "damping[*]", "armature[*]", "payload")
 HIDDEN: dict[str, Any] = {
     "gravity": GRAVITY, "friction": [0.08, 0.05], "damping": [0.02, 0.01], "armature": [0.002, 0.001],
 }  # fmt: skip
+
+
+WHEEL = """<robot name="wheel"><link name="base"/><link name="rim"><inertial><mass value="1"/>
+  <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="hub" type="continuous"><parent link="base"/><child link="rim"/><axis xyz="0 0 1"/>
+  <limit effort="10" velocity="10"/></joint></robot>"""
 
 
 def arm_motion(seed: int = 0, seconds: float = 30.0, hindered: Any = None, **changed: Any) -> Any:
@@ -342,6 +351,23 @@ def test_a_joint_that_rests_under_more_than_its_friction_is_named(tmp_path):
         assert all(0.04 < hold.excess <= 0.2 and rests[round(100 * hold.t)] for hold in result.holds)
 
 
+@pytest.mark.parametrize(("load", "holds"), [(1.97, 0), (2.1, 1)])
+def test_noise_of_positions_does_not_look_like_a_load_at_rest(load, holds, tmp_path):
+    """A wheel with friction of 2 N·m moves and rests for 0.8 s each; samples of its acceleration have much noise."""
+    urdf, rng = tmp_path / "wheel.urdf", np.random.default_rng(0)
+    urdf.write_text(WHEEL.replace('izz="0.1"', 'izz="0.5"'), "utf-8")
+    t = np.arange(0.0, 32.0, 0.002)[:, None]
+    s, turns = np.minimum(t % 1.6, 0.8) / 0.8, np.where(t % 3.2 < 1.6, 1.0, -1.0)
+    q = turns * (s**3 * (10.0 - 15.0 * s + 6.0 * s**2) - 0.5)
+    a = turns * 60.0 * s * (1.0 - 3.0 * s + 2.0 * s**2) / 0.64
+    tau = 0.5 * a + np.where(s < 1.0, 2.0 * turns, load) + 0.02 * rng.normal(size=t.shape)
+    q += 1e-4 * rng.normal(size=t.shape)
+    model = read_model(urdf, ["friction[*]", "armature[*]"])
+    recording: Any = SimpleNamespace(path="bag", joints=["hub"], t=t[:, 0], q=q, tau=tau)
+    found = estimate(model.parameters((0.0, 0.0, -9.81)), stretches.stretches([recording], model.robot)[0])
+    assert len(found.holds) == holds and all(hold.excess == pytest.approx(0.1, abs=0.02) for hold in found.holds)
+
+
 @pytest.mark.parametrize("part", [0.0, 0.5, 0.9])
 def test_noise_in_proportion_to_the_effort_has_its_own_weights(part):
     rng, count = np.random.default_rng(7), 4000
@@ -524,6 +550,20 @@ def test_a_bag_that_is_given_twice_is_refused(bag):
         twodof.fit(ARM, bag, FREE, gravity=(0.0, float("nan"), 0.0))
 
 
+def test_the_bags_of_a_fit_share_their_limits(tmp_path, monkeypatch):
+    """Each of these small bags spends 80 MB of the read budget."""
+    bag = bag_of(tmp_path / "bag", JOINTS, np.zeros((10, 2)), np.zeros((10, 2)))
+    schema = record(3, struct.pack("<H", 1), texts("std_msgs/msg/String", "ros2msg", ""))
+    records = schema + (channel(1, "/x") + message(b"")) * 40_000
+    (bag / "bag_1.mcap").write_bytes(HEADER + chunk(zstd.compress(records), len(records), "zstd") + FOOTER)
+    with pytest.raises(BagError, match="unpacks to more than 1000 times its size"):
+        twodof.fit(ARM, [bag] * 6, FREE)
+    (bag / "bag_1.mcap").unlink()
+    monkeypatch.setattr(fitting, "MAX_SAMPLES", 40 * len(JOINTS) * 8)
+    with pytest.raises(InputError, match=r"the bags to '.*bag' have over 0 MiB of joint states; give fewer$"):
+        twodof.fit(ARM, [bag] * 3, FREE)
+
+
 @pytest.mark.parametrize(
     ("gravity", "given", "friction"),
     [
@@ -582,10 +622,7 @@ def test_efforts_that_jump_between_samples_are_named(tmp_path):
 def test_damping_of_a_robot_of_one_joint_is_found(tmp_path):
     """A wheel on a vertical axis: the effort is I a + d v."""
     urdf = tmp_path / "wheel.urdf"
-    urdf.write_text("""<robot name="wheel"><link name="base"/><link name="rim"><inertial><mass value="1"/>
-      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-      <joint name="hub" type="continuous"><parent link="base"/><child link="rim"/><axis xyz="0 0 1"/>
-      <limit effort="10" velocity="10"/></joint></robot>""")
+    urdf.write_text(WHEEL, "utf-8")
     t = np.linspace(0.0, 20.0, 2001)[:, None]
     q, v, a = np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)
     result = twodof.fit(urdf, bag_of(tmp_path / "bag", ["hub"], q, 0.1 * a + 0.3 * v), "damping[*]")

@@ -151,15 +151,15 @@ def holds_of(
     values, rates = parameters.dynamics(parameters.values(z[:-1])), parameters.rates(z[:-1])[1]
     slow = [np.mean(s[each.bin == each.bin.min()] ** 2) for each, s in zip(rows, sd)]
     found, count = dict[int, Hold](), 0
-    for row, n, t in resting_rows(parameters, values, stretches, float(z[-1])):
+    for row, variance, t in resting_rows(parameters, values, stretches, float(z[-1])):
         side = np.sign(residual(row._replace(sign=np.zeros(1)), values, float(z[-1])))
-        row = row._replace(sign=side * np.sqrt(n))  # on the verge of slipping
+        row = row._replace(sign=side * row.one)  # on the verge of slipping
         direction = jacobian(row, values, rates)[0] * scales
-        noise = max(slow[row.joint], float(row.power[0] - row.tau[0] ** 2 / n))
+        noise = max(slow[row.joint], variance)
         excess = float((side * residual(row, values, float(z[-1])))[0])
         probability, count = float(norm.sf(excess / np.sqrt(noise + direction @ N @ direction))), count + 1
         if row.joint not in found or probability < found[row.joint].probability:
-            found[row.joint] = Hold(row.joint, t, excess / np.sqrt(n), probability)
+            found[row.joint] = Hold(row.joint, t, excess / float(row.one[0]), probability)
     return [hold for hold in found.values() if hold.probability * count < SIGNIFICANCE]
 
 

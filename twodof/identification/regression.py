@@ -28,11 +28,11 @@ from ..errors import InputError
 from ..plant.robot import Robot
 from .inertials import model_with
 from .parameters import Dynamics, Parameters
-from .stretches import EDGE, Array, Stretch
+from .stretches import EDGE, Array, Stretch, means
 
 LEAST_SAMPLES, LONGEST = 12, 400
 """Smallest and largest number of samples of a stretch in which a joint moves; a longer one is divided."""
-MOST_RESTING = 40  # samples of a stretch in which a joint may rest
+MOST_RESTING = 40  # means of samples of a stretch in which a joint may rest
 EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Edges of the frequency bins, in each of which noise has one variance, as fractions of the band."""
 UNMODELLED = ("drag", "load", "filter")
@@ -130,20 +130,26 @@ def rows_of(
 
 def resting_rows(
     parameters: Parameters, values: Dynamics, stretches: Sequence[Stretch], delay: float
-) -> Iterator[tuple[Rows, int, float]]:
-    """Yield, for each stretch in which a joint may rest, its row, the number of samples in it, and its time, s.
+) -> Iterator[tuple[Rows, float, float]]:
+    """Yield, for each stretch in which a joint may rest, its row, the variance of its effort, and its time, s.
 
-    The row is the mean of up to MOST_RESTING samples, times the square root of their number.
+    The row is a mean, scaled so that it has the noise of one sample. It is of means of samples, with weights that fade
+    to 0 at both ends, because the noise of positions is large in accelerations that are sampled or cut off.
     """
     for stretch in stretches:
         edge = int(np.ceil(EDGE / stretch.step))
         for i in range(len(parameters.robot.joints)):
             for begin, end in _runs(~stretch.moving[:, i]):
                 if end - begin > 3 * edge:
-                    part = stretch.part(slice(begin + edge, end - edge, max(1, (end - begin) // MOST_RESTING)))
-                    n = len(part.t)
+                    whole = stretch.part(slice(begin + edge, end - edge))
+                    many = -(-len(whole.t) // MOST_RESTING)
+                    cut: dict[str, Any] = {name: means(getattr(whole, name), many) for name in ("t", *"qva", "tau")}
+                    part = whole._replace(**cut)
+                    weights = np.sin(np.pi * (np.arange(len(part.t)) + 0.5) / len(part.t)) ** 2
+                    weights *= np.sqrt(many / np.sum(weights**2))
                     rows_in = projector(parameters, values, part, delay, True)
-                    yield rows_in(i, slice(None), np.full((1, n), n**-0.5), np.zeros(1, np.int64)), n, part.t[0]
+                    row = rows_in(i, slice(None), weights[None], np.zeros(1, np.int64))
+                    yield row, float(np.var(whole.tau[:, i])), part.t[0]
 
 
 def projector(

@@ -127,7 +127,7 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
             )
         end, many = t[-1] * (1.0 - HELD_OUT), max(1, int(1.0 / (MOST_RATE * h) + 1e-6))
         for a, b in whole:
-            stretch = _smooth(bag, _means(t[a:b], many), _means(q[a:b], many), _means(tau[a:b], many), many * h)
+            stretch = _smooth(bag, means(t[a:b], many), means(q[a:b], many), means(tau[a:b], many), many * h)
             split = int(np.searchsorted(stretch.t, end))
             for part, into in ((stretch.part(slice(split)), fitted), (stretch.part(slice(split, None)), held)):
                 if len(part.t) * many * h >= 0.5 * SHORTEST:
@@ -319,7 +319,7 @@ def _resampled(t: Array, tau: Array, way: Array, grid: Array, own: Array) -> Arr
     return out
 
 
-def _means(values: Array, many: int) -> Array:
+def means(values: Array, many: int) -> Array:
     """Return the means of each ``many`` consecutive samples."""
     used = len(values) // many * many
     return np.asarray(values[:used].reshape(-1, many, *values.shape[1:]).mean(axis=1)) if many > 1 else values
