@@ -551,6 +551,26 @@ def test_a_continuous_stimulus_is_interpolated_and_a_discrete_one_is_held(kind: 
     assert [row.outcome for row in found.values()] == ["passed"] * 2, found
 
 
+@pytest.mark.parametrize("effort", [10.0, 5.0])
+def test_values_at_the_start_are_compared(effort: float, tmp_path: Path) -> None:
+    """The effort is 10 q_des before the first step, too."""
+    files = {"e.csv": "time,q_des[1]\n0,1\n", "results.csv": f"time,tau[1]\n0,{effort}\n0.1,10\n"}
+    for row in rows(of_controller(files, tmp_path / "pd.fmu"), "fmpy").values():
+        assert row.outcome == ("passed" if effort == 10.0 else "failed"), row
+        assert effort == 10.0 or row.text.startswith("tau[1] is 10 instead of 5 at 0 s"), row
+
+
+@pytest.mark.parametrize("default", [True, False])
+def test_an_experiment_without_a_step_has_that_of_the_fmu_or_of_its_results(default: bool, tmp_path: Path) -> None:
+    """The third output counts the steps."""
+    results = "".join(f"{0.05 * (k + 1)!r},{(k + 1) * (5 if default else 1)}\n" for k in range(4))
+    step = {"<ModelVariables>": '<DefaultExperiment stepSize="0.01"/><ModelVariables>'} if default else {}
+    files = {"results.csv": f"time,steps\n{results}"}
+    times = 'startTime="0" stopTime="0.2"'
+    (row,) = rows(of_controller(files, tmp_path / "pd.fmu", times, pd_fmu(replaced=step))).values()
+    assert row.outcome == "passed", row
+
+
 @pytest.mark.parametrize("jump", [35, 36])
 def test_a_jump_of_a_stimulus_acts_at_its_communication_point(jump: int, tmp_path: Path) -> None:
     """1 + 36 * 0.01 is rounded to less than 1.36."""

@@ -511,6 +511,23 @@ def test_values_come_from_sets_and_mappings_the_outermost_last(plant: bytes, pd:
     np.testing.assert_allclose(q_of(system), by_hand(plant, tmp_path / "plant.fmu"), rtol=0, atol=1e-12)
 
 
+def test_names_in_bindings_that_do_not_exist_are_in_a_warning(
+    plant: bytes, pd: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They are a misspelt name, a vector without an index, and a source that the parameter set does not have."""
+    given = values("Kq Real 1", "q_des Real 1", "Kp Real 0.1")
+    parts = [binding(given), binding(given, mapping("absent Kd", "Kp Kp"))]
+    lines = ["pd.Kq, pd.q_des (name its elements: pd.q_des[1])", "absent"]
+    for part, line in zip(parts, lines):
+        elements = f"<ssd:Elements>{component('plant')}{component('pd', part)}</ssd:Elements>"
+        structure = ssd(f"{elements}<ssd:Connections>{WIRES}</ssd:Connections>")
+        system = loop(tmp_path / "loop.ssp", plant, pd, structure)
+        caplog.clear()
+        twodof.experiment(system)
+        text = "parameter bindings name variables that do not exist, and are ignored"
+        assert [record.getMessage() for record in caplog.records] == [f"'{system}': {text}: {line}"]
+
+
 def test_truth_values_are_connected(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     on = connectors({"on": "input"}, "<ssc:Boolean/>")
     wires = WIRES + connection("on", "pd.enabled")
@@ -949,6 +966,10 @@ def test_an_fmu_that_is_a_link_is_refused(plant: bytes, pd: bytes, tmp_path: Pat
 
 def test_a_refused_step_names_its_component(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     system = loop(tmp_path / "loop.ssp", plant, pd)
+    with pytest.raises(InputError, match=r"pd\.q\[1\] cannot be set: a connection drives it from plant\.q\[1\]"):
+        twodof.experiment(system, settings={"pd.q": 1.0})
+    with pytest.raises(FmuError, match=r"'pd', the `robot`, has no outputs q\[i\] and v\[i\]; there are: plant"):
+        twodof.load_fmu(system, "pd")
     with pytest.raises(InputError, match=r"pd\.tau"):
         twodof.experiment(system, settings={"pd.tau[1]": 1.0})
     with pytest.raises(twodof.TwoDofError, match=r"'plant': tau_cmd\[1\] = inf is not finite"):

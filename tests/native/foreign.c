@@ -10,11 +10,12 @@ enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES,
        READS_CHANGE, COUNTS, GREEDY, ALONE, FRAGILE,
        KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
        RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE, SHARES_PARAMETER,
-       KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER, FLUSHES };
+       KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER, FLUSHES,
+       DESTROYS, READS_STEER, NOT_EXACT, NOT_CONSTANT, WRONG_TIME, KEEPS_HANDLE, LEAVES_POINTER };
 #ifndef X
 #define X 1.0
 #endif
-typedef struct { double u, x, p; int phase; double t; int k, b; } M;
+typedef struct { double u, x, p; int phase; double t; int k, b, reads; } M;
 static double shared;
 static int count, living;
 static double shared_p, flushed;
@@ -76,9 +77,12 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, fmi2Real v[]) {
     M *m = c;
     for (size_t i = 0; i < n; i++) {
-        double value[] = {0.0, m->u, m->x, m->u - m->x, FAULT == NOT_FINITE ? NAN : y_of(m), m->p};
-        if (r[i] > 5 && FAULT == FRAGILE) abort();
-        if (r[i] > 5) return fmi2Error;
+        double value[] = {0.0, m->u, FAULT == NOT_EXACT ? m->x + 0.5 : m->x, m->u - m->x,
+                          FAULT == NOT_FINITE ? NAN : y_of(m), m->p, 0.0, 0.0, 0.0,
+                          FAULT == WRONG_TIME ? 1.01 * m->t : m->t, FAULT == NOT_CONSTANT ? 9.8 : 9.81};
+        if (r[i] > 10 && FAULT == FRAGILE) abort();
+        if (r[i] > 10) return fmi2Error;
+        m->reads++;
         if (FAULT == READS_CHANGE && r[i] == 4) m->x += 1e-3;
         v[i] = value[r[i]];
     }
@@ -92,23 +96,33 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
     if (FAULT == ENDS && t + h > 0.1 + 1e-9) return fmi2Discard;
     m->t += h;
     if (s) flushed = m->t;  /* noSetFMUStatePriorToCurrentPoint */
-    m->x += h * (m->u - m->x);
+    m->x += h * (m->u - m->x) + (FAULT == READS_STEER ? 1e-3 * m->reads : 0.0);
     shared += h * (m->u - shared);
     return fmi2OK;
 }
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) { *s = malloc(sizeof(M)); *(M *)*s = *(M *)c; return fmi2OK; }
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) {
+    if (*s && FAULT == KEEPS_HANDLE) return fmi2OK;
+    if (!*s) *s = malloc(sizeof(M));
+    *(M *)*s = *(M *)c;
+    return fmi2OK;
+}
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
     if (FAULT == CRASHES) abort();
     if (FAULT == FLUSHES && ((M *)s)->t < flushed) return fmi2Error;
     double u = ((M *)c)->u, p = ((M *)c)->p;
     int k = ((M *)c)->k;
     if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;
+    if (FAULT == DESTROYS) ((M *)s)->x = 0.0;
     if (FAULT == RESTORES_NO_INPUT) ((M *)c)->u = u;
     if (FAULT == LOSES_TUNABLE) ((M *)c)->p = p;
     if (FAULT == LOSES_INTEGER) ((M *)c)->k = k;
     return fmi2OK;
 }
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *s) { free(*s); *s = NULL; return fmi2OK; }
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *s) {
+    free(*s);
+    if (FAULT != LEAVES_POINTER) *s = NULL;
+    return fmi2OK;
+}
 fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate s, size_t *n) { *n = sizeof(M); return fmi2OK; }
 fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate s, fmi2Byte b[], size_t n) {
     for (size_t i = 0; i < n; i++) b[i] = ((char *)s)[i];

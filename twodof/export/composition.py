@@ -190,6 +190,10 @@ class _Variables(NamedTuple):
         """Return the type of a variable, without its range, which ``Variable.refusal`` has in words."""
         return Type(self.variables[name].type)
 
+    def source_of(self, _name: str) -> str:
+        """Return "", because a build has no connections."""
+        return ""
+
 
 def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, object]:
     """Return the given start values, completed by the start positions ``rest`` of the other joints."""

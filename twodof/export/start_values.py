@@ -60,6 +60,9 @@ class Variables(Protocol):
     def type_of(self, name: str) -> Type:
         """Return the type of a variable."""
 
+    def source_of(self, name: str) -> str:
+        """Return the source of the connection that drives a variable; "" without one."""
+
 
 def vector(variables: Mapping[str, object], group: str) -> list[str]:
     """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
@@ -119,6 +122,8 @@ def resolve_all(fmu: Variables, settings: Mapping[str, Setting]) -> tuple[dict[s
 
 def _checked(fmu: Variables, name: str, value: object) -> Value | str:
     variable = fmu.variables[name]
+    if source := fmu.source_of(name):
+        raise InputError(f"{name} cannot be set: a connection drives it from {source}; set that, or an input of it")
     if variable.causality not in ("input", "parameter"):
         start = name.replace(group := name.partition("[")[0], f"{group}_start", 1)
         remedy = f"; set {start}" if start in fmu.variables else ""

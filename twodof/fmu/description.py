@@ -139,6 +139,10 @@ class Fmu:
         """Return the type of a variable."""
         return self.variables[name].value_type
 
+    def source_of(self, _name: str) -> str:
+        """Return the source of the connection of a system that drives a variable; "" without one."""
+        return ""
+
     def groups(self, causality: str) -> dict[str, list[str]]:
         """Return vectors and scalars of one causality by group name."""
         return groups_of(self.variables, causality)

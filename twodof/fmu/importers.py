@@ -33,7 +33,10 @@ def in_this_master(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows
             values = dict(zip(reals, read()))
             return [values[name] if name in values else instance.value(name) for name in names]
 
-        return reference.rows(instance.set, instance.step, read_all)
+        starts = read_all()
+        rows = reference.rows(instance.set, instance.step, read_all)
+        rows[0] = starts
+        return rows
 
 
 def _starts(fmu: Fmu, reference: Reference) -> Values:
@@ -177,6 +180,10 @@ TOOLS: dict[str, tuple[str, Run, str]] = {
     "pathsim": ("pathsim_fmi", in_pathsim, "2"),
 }
 """Python packages of the tools, functions that run them, and the versions of FMI with which they are tried."""
+
+
+READ_AT_START = "", "fmpy"
+"""Tools whose runs begin with the outputs before the first step; "": this master."""
 
 
 def require(tools: Sequence[str]) -> None:

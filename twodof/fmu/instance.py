@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..errors import FmuError, SimulationError
 from ..export.typed_values import IN_FMI_3
 from .description import Fmu
-from .loading import NAMES, Prepared, loading, unique
+from .loading import NAMES, STATUSES, Prepared, loading, unique
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
@@ -273,7 +273,7 @@ class Instance:
         """Return the error of a call's status, with the FMU's own message, if any."""
         self._fatal = status == fmi2.fmi2Fatal
         outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
-        reason = f"a call failed, status {status}" if status > WARNING else "the FMU ends the run"
+        reason = f"a call failed, status {STATUSES.get(status, status)}" if status > WARNING else "the FMU ends the run"
         return SimulationError(self._said or reason, outcome=outcome)
 
     def failure_in_c(self, status: int) -> SimulationError:

@@ -12,6 +12,7 @@ from threading import Lock
 from fmpy import fmi1
 
 LOADING = Lock()
+STATUSES = {2: "discard: try another step size", 3: "error", 4: "fatal", 5: "pending"}
 NAMES: set[str] = set()  # of living instances
 
 

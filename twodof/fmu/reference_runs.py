@@ -91,7 +91,7 @@ class Reference(NamedTuple):
         step: Callable[[float, float], object],
         read: Callable[[], Iterable[float]],
     ) -> NDArray[np.float64]:
-        """Step an initialised tool; return the outputs after each step, and NaN for the start."""
+        """Step an initialised tool; return the outputs after each step, and NaN for the start values."""
         held, rows = self.inputs(0), []
         for k in range(self.steps):
             inputs = self.inputs(k)
@@ -101,8 +101,8 @@ class Reference(NamedTuple):
             rows.append([*read()])
         return np.array([[np.nan] * len(rows[0]), *rows])
 
-    def judge(self, rows: NDArray[np.float64]) -> str:
-        """Compare the columns of the results, one row for each communication point; return a line.
+    def judge(self, rows: NDArray[np.float64], first: int = 1) -> str:
+        """Compare the columns of the results, one row for each communication point from ``first`` on; return a line.
 
         Raises:
             SimulationError: the columns differ by more than the tolerance, or there is nothing to compare.
@@ -118,9 +118,9 @@ class Reference(NamedTuple):
             raise SimulationError(f"it has results at {numbers[:, 0].min():g} s, before its start")
         if not 0.0 <= self.tolerance < inf:
             raise SimulationError(f"its tolerance {self.tolerance:g} is not finite and >= 0")
-        kept = index > 0
+        kept = index >= first
         expected, found = numbers[kept, 1:], rows[index[kept]]
-        if not expected.size:
+        if not expected.size or not index.any():
             raise SimulationError("its results have no values after its start")
         off = np.abs(found - expected) / np.maximum(1.0, np.abs(expected).max(axis=0, initial=0.0))
         k, i = np.unravel_index(np.nanargmax(np.where(np.isnan(off), np.inf, off)), off.shape)
@@ -189,9 +189,13 @@ class _Files:
         """Return an experiment; None if it has no results as CSV, or is not a simulation over time."""
         times = {**experiment.attrib, **getattr(experiment.find("TransientSimulation"), "attrib", {})}
         results, stimuli, parameters = (experiment.find(tag) for tag in ("References", "Stimuli", "Parameters"))
-        if results is None or results.get("type", "text/csv") != "text/csv" or "stepSize" not in times:
+        if results is None or results.get("type", "text/csv") != "text/csv" or "stopTime" not in times:
             return None
-        start, stop, step = (float(times.get(f"{key}", 0.0)) for key in ("startTime", "stopTime", "stepSize"))
+        table = self.table(results.get("source", ""))
+        default = getattr(self._fmu.description.defaultExperiment, "stepSize", None)
+        start, stop = (float(times.get(key, 0.0)) for key in ("startTime", "stopTime"))
+        gap = np.diff(np.unique([start, *table[1][:, 0]])).min(initial=stop - start)
+        step = float(times.get("stepSize") or default or gap)
         count, name = (stop - start) / step if step > 0.0 else 0.0, experiment.get("name", "")
         if len(name) > MAX_NAME:
             raise ValueError(f"an experiment has a name of more than {MAX_NAME} characters: '{name:.50}'…")
@@ -203,7 +207,7 @@ class _Files:
             *(name, start, stop, step, float(times.get("tolerance", "nan"))),
             parameters={} if parameters is None else self.parameters(parameters.get("source", "")),
             stimuli=([], np.zeros((1, 1))) if stimuli is None else self.stimuli(stimuli.get("source", "")),
-            results=self.table(results.get("source", "")),
+            results=table,
             variables=self._fmu.variables,
         )
 

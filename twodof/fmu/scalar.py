@@ -30,6 +30,7 @@ class Scalar:
         relative: whether it is a difference of values, to which the offset of a unit does not apply.
         element: 0-based index in the array, row by row.
         low, high: texts of the range; None without one.
+        exact: whether its value is the start value until the end of initialisation, at least.
         items: numbers of the items of an enumeration by name; scalars of one type share it.
     """
 
@@ -46,6 +47,7 @@ class Scalar:
     low: str | None = None
     high: str | None = None
     items: Mapping[str, int] = field(default_factory=dict, hash=False)
+    exact: bool = False
 
     @property
     def start_value(self) -> float | bool | None:
@@ -86,6 +88,7 @@ def scalars(variable: ModelVariable, items: Mapping[str, int]) -> Iterator[Scala
         low=variable.min,
         high=variable.max,
         items=items,
+        exact=variable.initial == "exact" or variable.variability == "constant",
     )
     if not variable.dimensions:
         yield whole

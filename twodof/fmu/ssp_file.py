@@ -108,6 +108,7 @@ class Element:
     Attributes:
         source: member of the archive with the component's FMU; "" for a system.
         unsupported: messages about valid SSP features that a run does not support.
+        ignored: sources of parameter mappings that their parameter sets do not have.
         children, connections: elements inside a system, and its connections as XML elements.
     """
 
@@ -118,6 +119,7 @@ class Element:
     children: list[Element] = field(default_factory=list)
     connections: list[ET.Element] = field(default_factory=list)
     unsupported: list[str] = field(default_factory=list)
+    ignored: list[str] = field(default_factory=list)
 
     def walk(self) -> Iterator[Element]:
         """Yield all elements, each system after the elements inside it."""
@@ -198,8 +200,9 @@ class _File:
             connectors[connector.get("name", "")] = Connector(*facts)
         bindings = xml.findall(f"{SSD}ParameterBindings/{SSD}ParameterBinding")
         far = [b for b in bindings if any(each.get("sourceBase", "SSD") != "SSD" for each in b.iter())]
-        parameters = [parameter for b in bindings if b not in far for parameter in self._bound(b, name)]
-        element = Element(name, connectors, parameters)
+        ignored: list[str] = []
+        parameters = [parameter for b in bindings if b not in far for parameter in self._bound(b, name, ignored)]
+        element = Element(name, connectors, parameters, ignored=ignored)
         if far:
             element.unsupported.append(f"'{name}' has a parameter file inside its FMU: not supported")
         if xml.tag == f"{SSD}Component":
@@ -227,7 +230,7 @@ class _File:
             raise FmuError(f"'{self._path}': '{source:.80}' of '{name}' is not a file in it")
         return member
 
-    def _bound(self, binding: ET.Element, name: str) -> Iterator[Parameter]:
+    def _bound(self, binding: ET.Element, name: str, ignored: list[str]) -> Iterator[Parameter]:
         root = self._content(binding, f"{SSD}ParameterValues", SSV, "ParameterValues", name)
         units, prefix = units_in(root.find(f"{SSV}Units")), binding.get("prefix", "")
         if len(prefix) > MAX_NAME:
@@ -254,6 +257,8 @@ class _File:
                 converts = entry.get("suppressUnitConversion") not in TRUE
                 what = f"'{self._path}': the mapping of '{source}'"
                 yield parameter._replace(name=target, converts=converts, map=transformation(entry, what))
+            else:
+                ignored.append(source)
 
     def _check_once(self, names: list[str], what: str) -> None:
         """Refuse names that are not unique, as the standard demands of a parameter set and of the targets of a map."""

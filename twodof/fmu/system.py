@@ -18,6 +18,7 @@ from .scalar import Scalar
 from .ssp_file import IDENTITY, STRUCTURE, Affine, Parameter, read_ssp
 from .wiring import Link, Node, Wiring, conversion, order
 
+MOST_NAMED = 5  # names in a remark
 Start = float | bool | str
 """A start value of any type."""
 
@@ -39,6 +40,7 @@ class System(Fmu):
         recorded: name of the component that is the robot.
         nodes: the component's variable, or the system's connector, for each of ``variables``.
         bound: start values of components' variables from parameter bindings, also of connectors that pass them.
+        ignored: names in parameter bindings that no variable or connector has.
     """
 
     recorded: str = ""
@@ -48,13 +50,22 @@ class System(Fmu):
     initial: tuple[tuple[Node, ...], ...] = ()
     nodes: Mapping[str, Node] = field(default_factory=dict)
     bound: Mapping[Node, Start] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"<System '{self.path}': {', '.join(self.components)}; joints {', '.join(self.joints)}>"
 
+    def source_of(self, name: str) -> str:
+        """Return the source of the connection that drives a variable; "" without one."""
+        return next((f"{link.source}" for link in self.links if link.target == self.nodes[name]), "")
+
     def remarks(self, asked: Iterable[str] = ()) -> list[str]:
-        """Return lines about vectors that are connected in part, and settings that another FMU has too."""
+        """Return lines about ignored bindings, partly connected vectors, and settings that another FMU has too."""
         ends, lines = {link.target for link in self.links}, []
+        if self.ignored:
+            first = ", ".join(f"{name:.80}" for name in self.ignored[:MOST_NAMED])
+            more = f" and {len(self.ignored) - MOST_NAMED} more" * (len(self.ignored) > MOST_NAMED)
+            lines.append(f"parameter bindings name variables that do not exist, and are ignored: {first}{more}")
         for element, fmu in self.components.items():
             for names in fmu.groups("input").values():
                 left = [f"{element}.{name}" for name in names if Node(element, name) not in ends]
@@ -129,7 +140,7 @@ def load_system(path: Path, robot: str = "") -> System:
     links = wiring.links()
     batches, initial = (tuple(map(tuple, order(path, fmus, links, start))) for start in (False, True))
     chosen = _robot(path, fmus, robot)
-    starts = _bound(path, wiring)
+    starts, ignored = _bound(path, wiring)
     numbers = {node: value for node, value in starts.items() if not isinstance(value, str)}
     variables, nodes = _variables(path, wiring, fmus, links, numbers, chosen, _measuring(fmus, links, chosen))
     digest = hashlib.sha256(structure)
@@ -151,6 +162,7 @@ def load_system(path: Path, robot: str = "") -> System:
         initial=initial,
         nodes=nodes,
         bound={node: value for node, value in starts.items() if node.element in fmus},
+        ignored=(*ignored, *(name for element in top.walk() for name in element.ignored)),
     )
 
 
@@ -158,8 +170,11 @@ def _robot(path: Path, fmus: dict[str, Fmu], robot: str) -> str:
     """Return the name of the robot's component, and fill in the joint names of its FMU."""
     if robot and robot not in fmus:
         raise FmuError(f"'{path}' has no component '{robot}'{choice(robot, fmus)}")
-    having = [name for name, fmu in fmus.items() if fmu.vector("q") and fmu.vector("v")] if not robot else [robot]
+    having = [name for name, fmu in fmus.items() if fmu.vector("q") and fmu.vector("v")]
     robots = [name for name in having if fmus[name].variables[fmus[name].vector("q")[0]].causality == "output"]
+    if robot and robot not in robots:
+        raise FmuError(f"'{path}': '{robot}', the `robot`, has no outputs q[i] and v[i]{choice(robot, robots)}")
+    robots = [robot] if robot else robots
     if len(robots) != 1:
         some = f"; give one as `robot`: {', '.join(robots)}" if robots else f" among {', '.join(fmus)}"
         raise FmuError(f"'{path}' has {len(robots) or 'no'} components with outputs q[i] and v[i]{some}")
@@ -184,19 +199,22 @@ def _driving(links: list[Link], robot: str) -> set[str]:
     return driving
 
 
-def _bound(path: Path, wiring: Wiring) -> dict[Node, Start]:
-    """Return start values from parameter bindings; outer systems take precedence over inner ones.
+def _bound(path: Path, wiring: Wiring) -> tuple[dict[Node, Start], list[str]]:
+    """Return start values from parameter bindings, and unknown names; outer systems take precedence over inner ones.
 
     A connector with a value passes it to the connected variables; without one, they keep their own.
     """
     starts: dict[Node, Start] = {}
+    ignored = []
     for element in wiring.elements.values():
         for parameter in element.parameters:
-            node = wiring.find(f"{element.name}.{parameter.name}" if element.name else parameter.name)
-            if node is not None:  # by the standard, other parameters are ignored
+            name = f"{element.name}.{parameter.name}" if element.name else parameter.name
+            if (node := wiring.find(name)) is None:  # the standard ignores such parameters
+                ignored.append(f"{name} (name its elements: {name}[1])" if wiring.find(f"{name}[1]") else name)
+            else:
                 starts[node] = _value(path, wiring, node, parameter)
     passed = wiring.passed({node: value for node, value in starts.items() if not isinstance(value, str)}).items()
-    return starts | {node: _typed(path, node, wiring.scalar(node), value) for node, value in passed}
+    return starts | {node: _typed(path, node, wiring.scalar(node), value) for node, value in passed}, ignored
 
 
 def _value(path: Path, wiring: Wiring, node: Node, parameter: Parameter) -> Start:

@@ -11,6 +11,7 @@ from fmpy.model_description import ModelVariable
 from ..errors import SimulationError
 from .description import Fmu
 from .instance import Instance
+from .reference_runs import TIME_TOLERANCE
 from .scalar import scalars
 from .system_instance import instantiate_fmu
 
@@ -40,8 +41,10 @@ class Trial:
         outputs, inputs: names of real outputs and continuous inputs.
         starts: start values of real inputs and parameters that have one.
         discrete_starts: those of integers and Booleans.
+        exact: start values of other variables that are constant or have initial="exact".
         changing: names of inputs and parameters that may change between steps.
         others: names of integer and Boolean outputs.
+        clocks: names of the independent variable, at most one.
     """
 
     def __init__(self, fmu: Fmu, note: Callable[[str], object]) -> None:
@@ -60,6 +63,7 @@ class Trial:
         self.others = [
             n for n, v in fmu.variables.items() if v.causality == "output" and v.type in ("Integer", "Boolean")
         ]
+        self.clocks = [name for name, v in self.variables.items() if v.causality == "independent"]
         inputs = [name for name, v in self.variables.items() if v.causality == "input"]
         self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
 
@@ -67,6 +71,8 @@ class Trial:
         starts = {v: value for v in given if (value := v.start_value) is not None}
         self.starts = {v.name: value for v, value in starts.items() if v.type == "Real"}
         self.discrete_starts = {v.name: value for v, value in starts.items() if v.type != "Real"}
+        others = [v for v in fmu.variables.values() if v.exact and v.name not in {*self.starts, *self.discrete_starts}]
+        self.exact = {v.name: value for v in others if (value := v.start_value) is not None}
         self.changing = {v.name for v in starts if v.causality == "input" or v.variability == "tunable"}
 
     def changed_inputs(self) -> dict[str, float]:
@@ -117,10 +123,18 @@ class Trial:
             self.note(f"step {k + 1}")
             instance.step(self.start + k * self.step, self.step)
             rows.append(read())
+            self._compare_time(instance, k + 1)
             for name, value in zip(self.outputs, rows[-1]):
                 if not isfinite(value):
                     raise SimulationError(f"{name} is {value} after {k + 1} steps")
         return rows
+
+    def _compare_time(self, instance: Instance, steps: int) -> None:
+        """Raise for an independent variable that is not the time after some steps, within TIME_TOLERANCE of a step."""
+        time = self.start + steps * self.step
+        for name, value in zip(self.clocks, instance.reader(self.clocks)()):
+            if not abs(value - time) <= TIME_TOLERANCE * self.step:
+                raise SimulationError(f"{name}, the independent variable, is {value:.12g} at {time:.12g} s")
 
     def reader(self, instance: Instance) -> Callable[[], Outputs]:
         """Return a function that reads all outputs, real ones first."""

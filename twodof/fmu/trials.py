@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from ctypes import byref, c_void_p
 from functools import partial
 from itertools import accumulate
 from math import inf, isfinite
@@ -17,7 +18,7 @@ from fmpy.model_description import Unknown
 
 from ..errors import SimulationError
 from .derivative_trial import derivatives
-from .importers import TOOLS, Run, in_this_master
+from .importers import READ_AT_START, TOOLS, Run, in_this_master
 from .instance import Instance
 from .reference_runs import Reference
 from .system_instance import instantiate_fmu
@@ -32,28 +33,35 @@ Values = dict[str, float | bool]
 
 
 def simulation(trial: Trial) -> str:
-    """Do the steps of the default experiment, and read the outputs twice at the end."""
+    """Do the steps of the default experiment, read the outputs twice at the end, and repeat it without reads."""
     with trial.instance() as instance:
-        trial.compare(trial.rows(instance)[-1:], [trial.reader(instance)()], "in a second read at one time")
+        last = trial.rows(instance)[-1:]
+        trial.compare(last, [trial.reader(instance)()], "in a second read at one time")
+    with trial.instance() as instance:
+        for k in range(trial.steps):
+            trial.note(f"step {k + 1}, without reads")
+            instance.step(trial.start + k * trial.step, trial.step)
+        trial.compare(last, [trial.reader(instance)()], "in a run without reads between its steps")
     return f"{trial.steps} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
 
 
 def start_values(trial: Trial) -> str:
-    """Compare inputs and parameters in initialisation mode with their start values."""
-    if not trial.starts and not trial.discrete_starts:
-        raise UnpassedError("does not apply", "it states no start values of inputs or parameters")
+    """Compare inputs, parameters, constants and exact variables in initialisation mode with their start values."""
+    starts = {**trial.starts, **trial.discrete_starts, **trial.exact}
+    if not starts:
+        raise UnpassedError("does not apply", "it states no start values of inputs, parameters or exact variables")
     trial.note("initialisation mode")
     with instantiate_fmu(trial.fmu) as instance:
         instance.begin(trial.start, inf, {})
-        _compare_starts(trial, instance, trial.starts, "before it is set")
-    return f"{len(trial.starts) + len(trial.discrete_starts)} inputs and parameters have their start values"
+        _compare_starts(trial, instance, starts, "before it is set")
+    return f"{len(starts)} inputs, parameters and exact variables have their start values"
 
 
-def _compare_starts(trial: Trial, instance: Instance, reals: Mapping[str, float], when: str) -> None:
-    """Raise for a variable, of reals or of all integers and Booleans, that has another value than its start value."""
-    discrete = {name: instance.value(name) for name in trial.discrete_starts}
-    found = {**dict(zip(reals, instance.reader([*reals])())), **discrete}
-    for name, start in {**reals, **trial.discrete_starts}.items():
+def _compare_starts(trial: Trial, instance: Instance, starts: Mapping[str, float | bool], when: str) -> None:
+    """Raise for a variable that has another value than its start value."""
+    reals = [name for name in starts if name in trial.variables]
+    found = {**dict(zip(reals, instance.reader(reals)())), **{n: instance.value(n) for n in starts if n not in reals}}
+    for name, start in starts.items():
         if (value := found[name]) != start and not (value != value and start != start):
             raise SimulationError(f"{name} is {value!r} {when}, and its start value is {start!r}")
 
@@ -68,7 +76,7 @@ def reset(trial: Trial) -> str:
             trial.begin_again(instance, _other_values(trial, instance))
             trial.rows(instance)
         trial.begin_again(instance)
-        _compare_starts(trial, instance, before, "after a reset")
+        _compare_starts(trial, instance, {**before, **trial.discrete_starts}, "after a reset")
         trial.compare(once, trial.rows(instance), "after a reset")
     return "the run after a reset, and after a run with other values, is equal"
 
@@ -141,7 +149,7 @@ def serialised_state(trial: Trial) -> str:
         return _restored(trial, instance, instance.slave.deserializeFMUState(content), rows) + " in a new instance"
 
 
-def _saved(trial: Trial, instance: Instance) -> tuple[object, list[Outputs]]:
+def _saved(trial: Trial, instance: Instance) -> tuple[c_void_p, list[Outputs]]:
     """Return the state after half of the steps, and the outputs then and after each further step."""
     trial.require_outputs()
     half = trial.steps // 2
@@ -152,14 +160,27 @@ def _saved(trial: Trial, instance: Instance) -> tuple[object, list[Outputs]]:
     return saved, [before, *trial.rows(instance, half, half)]
 
 
-def _restored(trial: Trial, instance: Instance, saved: object, rows: Sequence[Outputs]) -> str:
-    """Restore and free a state, and compare the outputs with those after it was saved."""
-    half = trial.steps // 2
-    trial.note("restoring the state")
-    instance.slave.setFMUState(saved)
-    trial.compare(rows[:1], [trial.reader(instance)()], "at the restored state")
-    trial.compare(rows[1:], trial.rows(instance, half, half), "after the state was restored")
+def _restored(trial: Trial, instance: Instance, saved: c_void_p, rows: Sequence[Outputs]) -> str:
+    """Restore a state twice, and compare the outputs with those after it was saved; overwrite and free it."""
+    half, read = trial.steps // 2, trial.reader(instance)
+    instance.final.value = False
+
+    def restore(expected: Outputs, what: str, again: str) -> None:
+        trial.note("restoring the state")
+        instance.slave.setFMUState(saved)
+        trial.compare([expected], [read()], f"at the {what}{again}")
+
+    for again in ("", ", restored again"):
+        restore(rows[0], "restored state", again)
+        trial.compare(rows[1:], trial.rows(instance, half, half), f"after the state was restored{again and ' again'}")
+    trial.note("saving into an existing state")
+    save = instance.slave.fmi2GetFMUstate if trial.fmu.version == 2 else instance.slave.fmi3GetFMUState
+    save(instance.slave.component, byref(saved))
+    restore(rows[-1], "state that was saved into an existing one", "")
+    trial.note("freeing the state")
     instance.slave.freeFMUState(saved)
+    if saved:  # FMUs of pythonfmu 0.7, which run well in most tools
+        raise UnpassedError("remark", "the pointer to a state is not null after the state was freed, as FMI demands")
     return f"save, {half} steps, restore, {half} steps: equal"
 
 
@@ -289,7 +310,7 @@ def reference_run(trial: Trial, reference: Reference, tool: str = "") -> str:
     rows = run(trial.fmu, reference, names)
     if reference.tolerance != reference.tolerance:
         raise UnpassedError("does not apply", "the experiment states no tolerance")
-    return reference.judge(rows)
+    return reference.judge(rows, first=0 if tool in READ_AT_START else 1)
 
 
 TRIALS: dict[str, Callable[[Trial], str]] = {
