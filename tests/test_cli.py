@@ -359,6 +359,16 @@ def test_compilation_shows_progress(tmp_path):
     assert shown.stdout.endswith("\x1b[K")
 
 
+@pytest.mark.parametrize("verb", ["live", "page", "view"])
+def test_a_line_is_printed_before_libraries_are_loaded(verb):
+    code = (
+        "import sys; from twodof.cli import main, live, page, view\n"
+        "live.busy = page.busy = view.busy = lambda *_, **__: sys.exit('loaded: ' + str('numpy' in sys.modules))\n"
+        f"main.main(['{verb}', 'bag'])"
+    )
+    assert python("-c", code, env=ENVIRONMENT).stderr == "loaded: False\n"
+
+
 def test_each_help_begins_with_a_sentence_about_its_command():
     program, verbs = parser()
     for verb in (program, *(verb for name, verb in verbs.items() if name != "help")):

@@ -5,7 +5,7 @@ import argparse
 from .fmus import fast_fmu
 from .help import Parser
 from .options import OF_A_PAGE, add_fmu, add_options, add_output, parse_settings
-from .printing import print_next, quote, say
+from .printing import busy, print_next, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 from .view import address, open_page
 
@@ -18,9 +18,9 @@ def add(live: Parser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    from ..pages.live_page import live
-
     settings = parse_settings(options.settings)
+    with busy("loading libraries", silent=True):
+        from ..pages.live_page import live
     fmu = fast_fmu(options)
     with asked_to_stop() as asked:
         bags = live(

@@ -20,9 +20,10 @@ def add(page: Parser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     from ..files import free_name
-    from ..pages.arm import is_page, page
 
     settings = parse_settings(options.settings)
+    with busy("loading libraries", silent=True):
+        from ..pages.arm import is_page, page
     options.native = not options.fmu or is_robot(options.fmu)
     fmu = chosen_fmu(options)
     output = options.output or free_name(fmu.stem, ".html", is_page)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .help import Parser
 from .options import OF_A_PAGE, Keywords, add_options, add_robot_options, check_company, given_options, output_file
-from .printing import in_options, say
+from .printing import busy, in_options, say
 from .signals import asked_to_stop
 
 
@@ -24,7 +24,8 @@ def add(view: Parser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
-    from ..pages.replay import FILMS, export, view
+    with busy("loading libraries", silent=True):
+        from ..pages.replay import FILMS, export, view
 
     robot = given_options(options, "urdf", "mesh_dir", "frame", "fmu")
     if options.export:
