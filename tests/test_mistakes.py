@@ -142,6 +142,7 @@ MISTAKES: dict[str, str] = {
     "build robot.urdf --gravity 0,-9.81,0": "--gravity: expected 3 numbers with spaces between them",
     "page arm.fmu -o .html": "'.html': the name of a page ends in .html",
     "info nothing": "there is no FMU, bag or sweep 'nothing'",
+    "page arm.fmu -o page.htm": "'page.htm': the name of a page ends in .html",
     "page arm.fmu -o arm.fmu": "'arm.fmu': the name of a page ends in .html",
     "layouts arm.fmu -o notes.txt": "cannot make the folder 'notes.txt': File exists",
     # sweeps

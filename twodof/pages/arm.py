@@ -40,7 +40,7 @@ RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 LIMITS = ("low", "high", "effort", "velocity")  # of a joint
 GRAIN = 65535  # resolution of vertices, as parts of a mesh's size
 POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
-PAGES = ("", ".html", ".htm")
+PAGES = ("", ".html")
 """Suffixes of pages."""
 CONTAINER = b'<div class="arm" id="arm"'
 """Mark that identifies a page with an arm."""
