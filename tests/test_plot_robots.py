@@ -23,7 +23,7 @@ from twodof.bag.provenance import Provenance
 from twodof.errors import PlotError, TwoDofError
 from twodof.geometry.kinematics import quaternions
 from twodof.pages.replay import replay
-from twodof.plots import words
+from twodof.plots import runs, words
 from twodof.plots.figure import save
 from twodof.plots.linkage import load_linkage
 from twodof.plots.runs import drawing, plot
@@ -113,6 +113,20 @@ def test_rounding_errors_of_a_target_are_0_and_a_difference_has_a_unit(fmu_path,
     first, other = read_tracks(bags)
     assert first.settings["x_des"] == "(0, 0.2) m" and first.settings["q_noise"] == "1e−12"
     assert re.search(r"; RMS \S+ rad$", words.difference(first, other))
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("jointGripper", "joint\nGripper"),
+        ("elbowflexion", "elbowflex\nion"),
+        ("panda_joint1", "panda_\njoint1"),
+        ("a" * 11, "a" * 11),
+        ("shoulder_pan_joint", "shoulder_\npan_joint"),
+    ],
+)
+def test_a_joint_name_is_broken_between_words(name, shown):
+    assert runs._wrapped(name, 2.0) == shown
 
 
 def test_joints_that_slide_have_metres(tmp_path):

@@ -249,7 +249,9 @@ def test_two_maps_stand_side_by_side_with_crosses_and_a_pareto_front(native_path
         shown.set_viewport_size({"width": 1200, "height": 900})
         shown.goto(page.as_uri())
         shown.wait_for_selector("#maps[data-ready]")
+        key = shown.locator("#maps").evaluate("(maps) => maps.previousElementSibling.textContent")
         left, right, front = shown.evaluate(CHARTS)
+    assert "hollow: not defined" in key and "×: beyond the URDF" in key
     assert [chart["kind"] for chart in (left, right, front)] == ["map", "map", "front"]
     assert left["box"]["top"] == right["box"]["top"] and left["box"]["right"] <= right["box"]["left"]
     impossible = (table.effort_use > 1.0) | (table.velocity_use > 1.0)

@@ -29,6 +29,8 @@ MOST_RUNS, MOST_VALUES = 20_000, 1_000_000  # runs on a page, and their values; 
 MOST_NUMBERS = 2_000_000  # points of all curves of a page; later runs have no curves
 MOST_CURVES, POINTS = 2000, 200
 """Number of runs whose curves a page contains, and of points in each curve."""
+CROSSES = "×: beyond the URDF's effort or velocity limits"
+HOLLOW = "hollow: not defined, as the settling time of a run that did not settle"
 
 
 def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, best: Sequence[int]) -> str:
@@ -44,6 +46,7 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
     rows = table.iloc[:: max(1, -(-len(table) // most))]
     metrics = [name for name in METRICS if rows[name].notna().any()]
     columns = {name: _numbers(rows[name].to_numpy(dtype=float)) for name in ("run", *varied, *metrics)}
+    beyond = beyond_limits(rows)
     options = table.attrs["provenance"]["options"]
     content = {
         "varied": [*varied],
@@ -51,7 +54,7 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
         "units": {name: WRITTEN.get(unit, unit) for name, unit in table.attrs["units"].items()},
         "columns": columns,
         "outcome": rows["outcome"].tolist(),
-        "beyond": beyond_limits(rows).tolist(),
+        "beyond": beyond.tolist(),
         "best": [int(run) for run in best],
         "again": [f"twodof run {quote(table.attrs['provenance']['fmu']['file'])}"]
         + [f"--stop-time {options['stop_time']:g}", f"--step {options['step']:g}"]
@@ -59,7 +62,9 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
         "quoted": {name: quote(name) for name in varied},
         "curves": _curves(rows, bags),
     }
-    return f'<div id="maps"></div>\n{figures_html(content, "maps.js")}'
+    gaps = bool(rows[metrics].isna().any(axis=None))
+    key = "; ".join(["circle: the run below", *[CROSSES] * beyond.any(), *[HOLLOW] * gaps])
+    return f'<p>{key}</p>\n<div id="maps"></div>\n{figures_html(content, "maps.js")}'
 
 
 def _numbers(values: NDArray[np.float64]) -> list[float | None]:

@@ -132,8 +132,8 @@ def _units(panels: Sequence[Panel]) -> list[list[str]]:
 
 
 def _wrapped(name: str, height: float) -> str:
-    """Return a joint's name broken after underscores into lines that fit into its row."""
-    lines = re.findall(r".{1,11}$|.{1,10}_|.{1,11}", name)
+    """Return a joint's name broken after underscores and before capitals into lines that fit into its row."""
+    lines = re.findall(r".{1,11}$|.{1,10}_|.{1,11}(?=[A-Z])|.{1,11}(?=.{3})", name)
     room = int(height / 0.13)
     if len(lines) > room:
         lines[room - 1 :] = [lines[room - 1][:10] + "…"]

@@ -20,7 +20,7 @@ from ..errors import PlotError
 from ..export.closed_form import Array
 from ..sweeps.ranking import METRICS, ROUNDING, USE, beyond_limits, candidates, ranked, remark
 from .figure import Drawing, draw_head, html_of
-from .maps import map_page
+from .maps import CROSSES, HOLLOW, map_page
 from .settings import WRITTEN
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR, Style
 
@@ -105,9 +105,9 @@ def _draw(
     key = "★ least"
     beyond = _thinned(table[beyond_limits(table)] if len(varied) < 3 else table[:0])
     if len(beyond):
-        key += "    ×: beyond the URDF's effort or velocity limits"
+        key += f"    {CROSSES}"
     if len(varied) > 1:
-        key += "    hatched, hollow: not defined, as the settling time of a run that did not settle"
+        key += f"    hatched, {HOLLOW}"
     if {"Kp", "Kd"} <= {*varied}:
         key += "    dashed: critical damping, Kd = 2 √Kp"
     texts = (settings, key, remark(table))
