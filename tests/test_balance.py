@@ -71,7 +71,7 @@ FIRST = [
     ("joint", {**AWAY, "a_des": (20.0, 0.0), "payload": 0.3}, 5.0, "the payload of 0.3 kg"),
     ("task", {"q_min": (-0.2, -3.0), "payload": 0.002}, 5.0, "'joint1' stood at its lower limit"),
     ("task", {"Kp": 5.0, "damping": 0.05}, 5.0, "still approaches"),
-    ("task", {"tau_ext": (0.0, 0.3)}, 5.0, "does not know tau_ext = (0, 0.3)"),
+    ("task", {"tau_ext": (0.0, 0.3)}, 5.0, r"does not know tau_ext[2] (of joint 'joint2') = 0.3 N·m"),
     ("joint", {**AWAY, "q_max": (0.6, 3.0), "tau_ext": (0.2, 0.0)}, 5.0, "'joint1' is out of reach by 0.3 rad"),
     ("task", {"x_des": (0.6, 0.05), "payload": 0.1}, 5.0, "the target is out of reach by"),
     ("joint", {**AWAY, "Kp": 0.0, "Kd": 50.0, "control_period": 0.02}, 5.0, "Kp = 0: the controller"),

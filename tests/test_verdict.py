@@ -14,7 +14,7 @@ import pytest
 from failures import FAILURES, ROBOTS, Failure, fmu_of, good_runs
 from numpy.typing import ArrayLike
 from page_causes import page_causes
-from recordings import third_party_bag
+from recordings import build, chain_urdf, third_party_bag
 from scipy.optimize import brute, differential_evolution
 from scipy.spatial.transform import Rotation
 from sinks import Memory
@@ -132,6 +132,22 @@ def test_a_failed_run_has_a_line(settings: dict[str, Any], line: str) -> None:
     lines = twodof.simulate(fmu_of("arm", "task"), settings={**settings, **failures.LARGE_STEPS}).verdict.lines
     assert any(line in each for each in lines), "\n".join(lines)
     assert not re.search(r"\d{4}\S* %|e\+\d+ %", "".join(lines))  # no percentage is large
+
+
+def test_errors_of_joints_that_turn_and_slide_have_no_common_size(tmp_path: Path) -> None:
+    fmu = build(tmp_path, chain_urdf("Xz"), control="joint", gravity=(0.0, 0.0, 0.0))
+    settings: list[dict[str, Any]] = [
+        {"q_des": (0.5, 1.0), "Kp": 1.0, "Kd": 0.1},
+        {"q_des": (0.5, 1.0), "Kp": 1.0, "tau_ext": (5.0, 2.0)},
+        {"q_des": (3.0, 1.0), "tau_ext": (5.0, 0.0)},
+        {"q_des": (1e-3, 0.0), "Kd": 0.1, "tau_ext": (0.0, 2.0)},
+    ]
+    verdicts = [twodof.simulate(fmu, settings=each, stop_time=3.0).verdict for each in settings]
+    for verdict in verdicts:
+        assert verdict.outcome == "not reached"
+        assert not re.search(r"rad or m|e\+\d+ %", "".join(verdict.lines)), "\n".join(verdict.lines)
+    words = "the controller does not know tau_ext[1] (of joint 'j1') = 5 N, tau_ext[2] (of joint 'j2') = 2 N·m"
+    assert any(words in line for line in verdicts[1].lines)
 
 
 @pytest.mark.parametrize(

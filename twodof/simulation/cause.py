@@ -26,6 +26,7 @@ KINDS = {
     "velocity": "a speed beyond the URDF's limit",
 }
 """Kinds of causes in their order; a cause may lead to those after it."""
+EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
 FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
 SMALL = 0.02  # part of an error below which a cause does not count
 MOTION = ("effort", "velocity")  # kinds that show what the motion needs, and do not cause it

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..plant.urdf import Joint
 from ..plant.variables import EXACT, GAINS
 from .aim import BAND
-from .cause import FLOOR, FOLLOWING, KINDS, MOTION, MOVING, SMALL, Cause, point_text
+from .cause import EFFORT_UNITS, FLOOR, FOLLOWING, KINDS, MOTION, MOVING, SMALL, Cause, point_text
 from .controller_causes import damping, feedforward, gains, load, sampled
 from .judge import AT_LIMIT, Judge
 from .settling_causes import late_change, slow, unsettled
@@ -27,7 +27,6 @@ GROWN = 3.5  # logarithm of the growth from which on an unstable loop shows in a
 LASTING = 0.5  # part of the error due to motion, below which the error does not approach 0
 TOGETHER = 2.0  # ratio of distances from which on position and orientation are out of reach only together
 EXPLAINED = 0.1  # part of an error that a target out of reach may leave to its consequences
-EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
 
 
 def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...]:

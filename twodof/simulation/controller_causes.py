@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from .aim import BAND
-from .cause import FLOOR, Cause, point_text
+from .cause import EFFORT_UNITS, FLOOR, Cause, point_text
 from .judge import AT_LIMIT, Judge
 from .sampled_loop import quickest_gains, spectral_radius, stable_gains
+from .setup import Array
 
 UNSTABLE = 1.0 + 1e-6  # spectral radius, above rounding
 SLIGHT = 1e-4  # torque, relative to the largest effort, below which a load does not count
@@ -109,12 +110,25 @@ def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
     kind, tail, share = ("load", "", max(drags)) if heavy else ("drag", " in the URDF", 0.0)
     if each and (heavy or _drags(judge)):
         yield Cause(kind, f"the controller does not know the damping {names}{tail}", share, subject="damping")
-    for group, unit in (("tau_ext", ""), ("f_ext", " N")):
-        values = judge.given(group)
+    force, torque = judge.given("f_ext"), judge.given("tau_ext")
+    for group, values, text in (("tau_ext", torque, _torques(judge, torque)), ("f_ext", force, _force(force))):
         share = _share(judge, np.abs(values).max(initial=0.0) * (LEVER if group == "f_ext" else 1.0))
         if share > slight:
-            text = f"the controller does not know {group} = {point_text(values)}{unit}; raise Kp"
-            yield Cause("load", text, share, subject=group)
+            yield Cause("load", f"the controller does not know {text}; raise Kp", share, subject=group)
+
+
+def _force(values: Array) -> str:
+    return f"f_ext = {point_text(values)} N"
+
+
+def _torques(judge: Judge, values: Array) -> str:
+    """Return the external torques that are not 0 in words, the largest three with their joints."""
+    own = sorted(np.flatnonzero(values), key=lambda i: -abs(values[i]))
+    units = [EFFORT_UNITS.get(unit, "") for unit in judge.setup.units]
+    texts = [
+        f"tau_ext[{i + 1}] (of joint '{judge.setup.joints[i]}') = {values[i]:.4g} {units[i]}".rstrip() for i in own[:3]
+    ]
+    return ", ".join(texts) + f" and {len(own) - 3} more" * (len(own) > 3)
 
 
 def payloads(judge: Judge) -> tuple[float, float]:

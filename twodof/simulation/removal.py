@@ -160,6 +160,8 @@ class _Trials:
         runs, unit = (result, self._judge), unit_of_error(result, name)
         (last, before), (rms, rms_before) = [run.aims[name].last for run in runs], [_rms(run, name) for run in runs]
         if (last < before) != (rms < rms_before):
+            if not unit:
+                return f"an RMS error {rms / rms_before:.3g} times as large"
             return f"RMS error {rms:.3g} {unit} instead of {rms_before:.3g} {unit}"
         if name != "q":
             return f"{last:.3g} {unit}"

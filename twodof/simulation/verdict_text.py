@@ -145,7 +145,7 @@ def _remainder(parts: Mapping[str, float]) -> str:
     rest = 1.0 - sum(parts.values())
     if not parts or abs(rest) < SMALL:
         return ""
-    size = f"{100.0 * abs(rest):.2g} %"
+    size = f"{float(f'{100.0 * abs(rest):.2g}'):g} %"
     return f"everything else: {size} of the error" if rest > 0.0 else f"everything else reduces the error by {size}"
 
 
@@ -191,12 +191,13 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         moves = {name: aim for name, aim in judge.aims.items() if aim.first >= FLOOR} or judge.aims
         units = {name: unit_of_error(judge, name) for name in moves}
         grown = [
-            f"the error of the {ERRORS[name]} grew from {aim.first:.3g} {units[name]} to {aim.last:.3g} {units[name]}"
+            f"the error of the {ERRORS[name]} grew"
+            + f" from {aim.first:.3g} {units[name]} to {aim.last:.3g} {units[name]}" * bool(units[name])
             for name, aim in moves.items()
             if aim.last > aim.first
         ]
-        firsts = [f"{aim.first:.3g} {units[name]}" for name, aim in moves.items()]
-        late = ", ".join(grown) or f"not within 2 % of the initial error of {' and '.join(firsts)}"
+        firsts = " and ".join(f"{aim.first:.3g} {units[name]}" for name, aim in moves.items() if units[name])
+        late = ", ".join(grown) or "not within 2 % of the initial error" + f" of {firsts}" * bool(firsts)
         moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
         only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
         within = only if outcome == "not reached" else f"within 2 % after {settling:.4g} s"
@@ -204,8 +205,9 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         if "overshoot" in numbers and (numbers["overshoot"] or outcome == "reached"):
             past = numbers["overshoot"]
             name, aim = next(iter(judge.aims.items()))
-            far = f"the target is passed by {past * aim.first:.3g} {unit_of_error(judge, name)}"
-            parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else far)
+            unit = unit_of_error(judge, name)
+            size = f"{past * aim.first:.3g} {unit}" if unit else f"{past:.3g} times the initial error"
+            parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else f"the target is passed by {size}")
     elif outcome == "not reached":
         parts.append("the run starts at its target")
     if "rms_error" in numbers:
@@ -223,9 +225,9 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
 
 
 def unit_of_error(judge: Judge, name: str) -> str:
-    """Return the unit of an output's error; joints of both kinds have none."""
+    """Return the unit of an output's error; "" for joints of both kinds, whose errors have no common size."""
     units = {*judge.setup.units} if name == "q" else {"m" if name == "x" else "rad"}
-    return units.pop() or "rad" if len(units) == 1 else "rad or m"
+    return units.pop() or "rad" if len(units) == 1 else ""
 
 
 def _rest(judge: Judge, outcome: str) -> str:
