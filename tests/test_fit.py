@@ -230,7 +230,7 @@ def test_an_error_that_the_residuals_look_like_hides_no_other_one(bag):
     result = twodof.fit(ARM, bag, FREE, gravity=GRAVITY)
     suspects = (Suspect("gain:joint2", 0.6931, 1e-9),)
     remarks = replace(result, misfits=(Misfit(1, 0.01, 9.0, 1e-12, 0.007),), suspects=suspects).remarks
-    assert "explains these data only roughly, most at joint 'joint2'" in remarks[0]
+    assert "explains these data only roughly, worst at joint 'joint2'" in remarks[0]
     assert "look like efforts of joint 'joint2' that need about +100 %" in remarks[1]
     assert "mass or centre of a link that is not free" in remarks[1]
 

@@ -55,7 +55,7 @@ def test_a_page_has_the_verdict_the_parameters_and_the_curves(result: twodof.Fit
                 tables = [each.inner_text() for each in page.locator(TABLES).all()]
                 figures = page.evaluate(CURVES)
     assert told.startswith("The model explains these data") and "do not determine payload_com[3]\n" in told
-    known = [row for row in result.rows if row[3] != "not seen"]
+    known = [row for row in result.rows if row[3] != "not determined"]
     assert [row.split("\t") for row in tables[0].splitlines()] == [[*row] for row in known]
     assert len(known) == len(result.rows) - 1 and "payload_com[3]\t0\t" in tables[1]
 
@@ -82,7 +82,7 @@ def test_the_verdict_on_a_hidden_spring_names_the_joint(tmp_path: Path) -> None:
     q, effort = noisy(arm_motion(stiffness=[0.0, 0.1]))
     page = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort), FREE, gravity=GRAVITY).page().decode()
     verdict = page.partition('<p class="verdict"><b>')[2]
-    assert verdict.startswith("The model does not explain these data, least at joint &#x27;joint2&#x27;")
+    assert verdict.startswith("The model does not explain these data, worst at joint &#x27;joint2&#x27;")
     assert page.count(" % of the effort, not noise</td>") == 1
 
 

@@ -67,14 +67,14 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_reports_it(t
     monkeypatch.setattr("twodof.export.composition.host_platform", lambda fmi=2: "linux64")  # what can run here
     assert main(["run", "--stop-time", "0.1", "-o", "bag"]) == 0
     captured = capsys.readouterr()
-    assert "the Python flavour is for Linux x86-64: building the native one" in captured.err
+    assert "a Python FMU needs Linux x86-64: building a native FMU" in captured.err
     assert "TwoDof-native.fmu" in captured.out
 
 
 @pytest.mark.parametrize(
     "options, message",
     [
-        (FmuOptions(platforms=("win64",)), "for the native flavour only"),
+        (FmuOptions(platforms=("win64",)), "for native FMUs only"),
         (FmuOptions(native=True, link_environment=True), "needs no Python environment"),
     ],
 )
@@ -115,5 +115,5 @@ def test_the_shipped_arms_file_is_identified_by_its_inputs(tmp_path, monkeypatch
 def test_the_python_flavour_is_of_fmi_2(fmu_path, tmp_path):
     """It accepts `fmi=2`."""
     assert build_fmu(tmp_path / "A.fmu", FmuOptions(fmi=2)).read_bytes() == fmu_path.read_bytes()
-    with pytest.raises(twodof.TwoDofError, match="native flavour only"):
+    with pytest.raises(twodof.TwoDofError, match="native FMUs only"):
         build_fmu(tmp_path / "B.fmu", FmuOptions(fmi=3))

@@ -470,7 +470,7 @@ def test_the_limits_of_this_flavour_are_listed_row_by_row(fmu_path, native_path)
     for fmu in (fmu_path, native_path):
         with zipfile.ZipFile(fmu) as archive:
             page = archive.read("documentation/index.html").decode()
-        section = page.partition("<h2>Limits of this flavour</h2>")[2].partition("<h2>")[0]
+        section = page.partition("<h2>Limits of the Python FMU</h2>")[2].partition("<h2>")[0]
         rows.append(re.findall("<tr><td>(.*?)</td>", section, re.DOTALL))
     python, native = rows
     assert native == []

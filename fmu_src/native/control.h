@@ -24,8 +24,8 @@ typedef double Matrix[N_JOINTS][N_JOINTS];
 /* Add ∂(Jᵀ f)/∂q of a force at the task frame to slope. */
 static void add_force(const double f[3], const JointMotion motion[N_BODIES], Matrix slope);
 
-/* Add the derivatives of the law's accelerations, given, by q and v to slope. The motions are those under the law.
-   Returns false, and adds nothing, where J has not full rank. */
+/* Add the derivatives of the law's accelerations `given` with respect to q and v to slope, for the motions under the
+   law. Returns false, and adds nothing, where J does not have full rank. */
 static int add_command_by_states(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                                  const JointMotion motion[N_BODIES], const double given[N_JOINTS], int rank,
                                  double slope[X][N_JOINTS]);

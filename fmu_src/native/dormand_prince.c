@@ -7,8 +7,8 @@
 
 enum { STAGES = 6 }; /* evaluations of the equations of motion in one step */
 
-/* One integration step from y to y_new in one regime, by Dormand–Prince, ROS34PW2 or Heun. The first and the last of the
-   derivatives K are those at the ends; the last stage is y_new. */
+/* One integration step from y to y_new in one regime (stops.h), by Dormand–Prince, ROS34PW2 or Heun. The first and the
+   last of the derivatives K are those at the ends; the last stage is y_new. */
 typedef struct {
     const Plant *plant;
     double size;                           /* s */
@@ -108,8 +108,8 @@ static double dormand_prince(Step *step)
     return error_norm(step, error);
 }
 
-/* The same with a method of second order, with K[0…1], of which K[1] is at the state of Euler's method; its error is
-   the norm. */
+/* Fill y_new, K[1] and P by Heun's method, of second order; K[1] is at the state of Euler's method. Return the norm of
+   the error of Euler's method. */
 static double heun(Step *step)
 {
     double error[N_STATES];

@@ -5,7 +5,7 @@
 
 /* Bounds for Dormand and Prince's interpolant; the cubic has smaller ones, 1.07 and 2. */
 static const double REACH = 1.66, PACE = 3.72;
-enum { HALVINGS = 7, LOOKS = 10 }; /* the latter: at most, of a joint */
+enum { HALVINGS = 7, LOOKS = 10 }; /* most halvings of an interval, most times examined for a joint */
 static const double DOUBT = 0.25, LATE = 1.0 / 256.0;
 static const double TOGETHER = 1.0 / 33554432.0; /* 2⁻²⁵ */
 /* Weights of the efforts at the start, at both thirds and at the end of a stiff step. */

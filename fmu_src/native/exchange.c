@@ -30,7 +30,7 @@ static Instance *enter_with(void *component, Call call, const void *values, size
     return instance;
 }
 
-static const char CLOCK_NAME[] = "control_clock"; /* of an FMU that is clocked */
+static const char CLOCK_NAME[] = "control_clock"; /* name in FMUs built with --clocked */
 
 /* Refuse a call that leaves out the next tick or comes before it. */
 static Status off_tick(Instance *instance, Call call, double tick)

@@ -30,8 +30,8 @@ static const double FINEST_TOLERANCE = 1.0 / 68719476736.0; /* 2⁻³⁶ */
 static const double NUDGE = 1e-6;
 /* Fraction of the largest step. Joints that an impact moves, and that come to rest within it, stop with the impact. */
 static const double WINDOW = 1.0 / 64.0;
-/* Largest short step, by which an event soon is reached, as a fraction of the largest step; and, for joints that stop
-   together, as a multiple of the time to the first one. */
+/* Largest short step to an event that is expected soon, as a fraction of the largest step; and, for joints that stop
+   together, as a multiple of the time to the first stop. */
 static const double SHORT = 0.25, LONGER = 1024.0;
 
 /* Determine the regime at y, where joints may rest. */

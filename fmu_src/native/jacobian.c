@@ -86,7 +86,7 @@ static void bring_to_rest(const double a[N_JOINTS], JointMotion motion[N_BODIES]
     }
 }
 
-/* Add the weighted rows of ∂ID by q and, unless at rest, v to slope. */
+/* Add the weighted rows of ∂ID with respect to q and, unless at rest, v to slope. */
 static void add_inverse_dynamics(const JointMotion motion[N_BODIES], const JointForce force[N_BODIES], int at_rest,
                                  const double weight[N_JOINTS], double slope[X][N_JOINTS])
 {
@@ -141,7 +141,7 @@ static void invert_mass(Matrix M, const Stops *stops)
     }
 }
 
-/* Add the derivatives of the law's result by states and, from a column on, inputs to slope. */
+/* Add the derivatives of the law's result with respect to states, and inputs from column `first` on, to slope. */
 static void add_command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops,
                         int first, const double given[N_JOINTS], const JointMotion motion[N_BODIES],
                         double slope[X][N_JOINTS])
@@ -174,7 +174,7 @@ static int all_act(const double value[N_VARIABLES], const JointPosition joint[N_
     return all;
 }
 
-/* Add δτ of a law for its acceleration, given, with the model that it knows, to slope. */
+/* Add δτ of a law for its acceleration `given`, by the model that it knows, to slope. */
 static void add_law(const double value[N_VARIABLES], const JointPosition joint[N_BODIES], const Stops *stops, int first,
                     const double given[N_JOINTS], const double acts[N_JOINTS], double slope[X][N_JOINTS])
 {
@@ -212,7 +212,7 @@ static void add_free_parameters(const Plant *plant, const Stops *stops, const do
     }
 }
 
-/* Add ∂(Jᵀ f) of the external force by q and f to slope; return false if that by q is 0. */
+/* Add ∂(Jᵀ f) of the external force with respect to q and f to slope; return false if ∂(Jᵀ f)/∂q is 0. */
 static int add_external_force(const double f[3], const JointMotion motion[N_BODIES], double slope[X][N_JOINTS])
 {
     Matrix rotated = {{0}};

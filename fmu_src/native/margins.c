@@ -1,5 +1,5 @@
-/* Margins, which are negative after the end of a regime, and the location of their zeros on the dense output of a step.
-   The rules and their derivation are in plant/event_search.py. */
+/* Margins, which are negative after the end of a regime (stops.h), and the location of their zeros on the dense output of
+   a step. The rules and their derivation are in plant/event_search.py. */
 #include <math.h>
 #include <stddef.h>
 

@@ -98,8 +98,8 @@ typedef struct {
     double R[3][3], p[3], ratio[2];
 } JointFrame;
 
-/* For all bodies that a joint moves: the angular part of Bᵀ s, whose linear part is 0, I s, and with the motion x of a
-   joint before it, derivatives of their effort on that joint: by q, by_q·x, and by v, by_v·x. */
+/* Terms of all bodies that a joint moves: I s, and the angular part of Bᵀ s, whose linear part is 0. by_q·x and by_v·x
+   are the derivatives of their effort on a joint before it, whose motion is x, with respect to q and v. */
 typedef struct {
     double coriolis[3], inertial[6], by_q[6], by_v[6];
 } JointForce;
@@ -118,7 +118,7 @@ INTERNAL void joint_frame(const JointFrame *frame, const double position[3], con
 INTERNAL void joint_motion(const JointFrame *frame, const double rate[2], const JointMotion *before,
                            JointMotion *motion);
 
-/* Compute a joint's terms and load by its body and the load beyond it; the second one for motions at rest. */
+/* Compute a joint's terms and load from its body and the load beyond it; joint_force_at_rest does so for v = 0. */
 typedef void JointTerms(const EndBody *body, const JointMotion *motion, const Load *beyond, Load *load,
                         JointForce *force);
 INTERNAL JointTerms joint_force, joint_force_at_rest;

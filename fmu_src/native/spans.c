@@ -1,6 +1,6 @@
-/* Steps of FMUs in one call. It is no function of FMI: calls from Python, seven for a step of a plant and its
-   controller, take longer than the step of a small robot. The importer prepares the calls of a step, also those of FMUs
-   of other vendors. A change of the arguments needs another name. */
+/* Many steps of FMUs in one call, in addition to the functions of FMI: calls from Python, seven for a step of a plant
+   and its controller, take longer than the step of a small robot. The importer prepares the calls of a step, also those
+   of FMUs of other vendors. If the arguments change, the name must change too. */
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>

@@ -72,7 +72,7 @@ INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_
 }
 
 #ifndef IS_COMPLEX
-/* Fraction of the times within which events at rigid stops are one: they shrink with rtol below its default. */
+/* Factor of the times within which events at rigid stops count as one: below 1 if rtol is below its default. */
 INTERNAL double coarseness(const Plant *plant)
 {
     return fmin(1.0, plant->value[RTOL] / USUAL_RTOL);

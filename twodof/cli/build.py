@@ -26,25 +26,25 @@ from .printing import busy, print_next, print_table, quote, say, written
 def add(build: Parser) -> None:
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "output file (<name>.fmu); - is the standard output", output_file)
-    option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the shipped planar 2-DoF arm)")
+    option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the default arm)")
     text = "robot of an installed package, such as panda; --list-robots prints them"
     option("--robot", dest="stock", type=not_empty, metavar="NAME", help=text)
     flag("--list-robots", help="print the names of these robots")
-    option("--urdf", type=Path, metavar="U", help="same as the argument URDF")
-    option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
+    option("--urdf", type=Path, metavar="FILE", help="same as the argument URDF")
+    option("--mesh-dir", type=Path, metavar="FOLDER", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="omit the URDF's meshes from the FMU")
     text = "controlled link (EndEffector, or the last link, if there is only one)"
     option("--frame", type=not_empty, help=text, completer=links)
     add_options(build, "--lock")
-    option("--axes", help="task axes, letters of xyz (xy for the shipped arm, else xyz)")
-    text = "gravity, m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)"
+    option("--axes", help="task axes, letters of xyz (xy for the default arm, else xyz)")
+    text = "gravity, m/s2 in the root frame (0 -9.81 0 for the default arm, else 0 0 -9.81)"
     option("--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"), help=text)
     option("--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m")
     text = "control law: target of the frame, target of each joint, or efforts (%(default)s)"
     option("--control", choices=("task", "joint", "effort"), default="task", help=text)
-    text = "robot under its control law, or the control law alone, as a native FMU (%(default)s)"
+    text = "robot with its controller, or the controller alone, as a native FMU (%(default)s)"
     option("--part", choices=("all", "controller"), default="all", help=text)
-    text = "let an input clock sample the controller, for tools with event mode (--part controller --fmi 3)"
+    text = "give the controller an input clock, for tools with event mode (--part controller --fmi 3)"
     flag("--clocked", help=text)
     text = "build plant and controller as two native FMUs, connected in an SSP file"
     option("--split", action="store_const", dest="part", const="split", help=text)
@@ -52,10 +52,10 @@ def add(build: Parser) -> None:
     option("--with", dest="outputs", nargs="+", choices=("M", "h", "J", "drift"), default=[], help=text)
     text = "make a parameter an input, with derivatives (--native): gravity, payload, payload_com, 'friction[*]',"
     text += " 'damping[*]', 'armature[*]', mass:LINK, com:LINK, inertia:LINK; repeatable"
-    build.add_repeatable("--free", metavar="P", help=text)
-    flag("--orientation", help="control the frame's orientation too")
+    build.add_repeatable("--free", metavar="PATTERN", help=text)
+    flag("--orientation", help="also control the orientation of the frame")
     add_options(build, "--set")
-    option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
+    option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the default arm)")
     flag("--overwrite", help="replace an existing file (without it, only the default arm's FMU is replaced)")
     flag("--link-environment", help="store the paths of this Python's packages in a Python FMU")
     _add_native(build)
@@ -68,7 +68,7 @@ def _add_native(build: Parser) -> None:
     build.add_repeatable(
         "--platform",
         dest="platforms",
-        metavar="P",
+        metavar="NAME",
         help="platform of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
         " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
     )

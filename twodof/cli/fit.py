@@ -40,7 +40,7 @@ def add(fit: Parser) -> None:
         help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
         " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT, bias:JOINT; repeatable",
     )
-    text = "without bags: write a motion of S seconds, from whose recording a fit is most precise"
+    text = "without bags: write a motion of S seconds to record, for the most precise fit"
     option("--design", type=float, metavar="S", help=text)
     add_output(fit, "PATH", "folder of the fitted robot (fitted), or motion: a .csv file (excite.csv) or a bag")
     text = "link of the payload (the last link, if there is only one)"

@@ -37,7 +37,7 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
 
     native = options.native or host_platform() != "linux64"
     if native and not options.native:
-        say("the Python flavour is for Linux x86-64: building the native one", error=True)
+        say("a Python FMU needs Linux x86-64: building a native FMU", error=True)
     if not of_urdf:
         return _default_arm(options.verb, native=native)
     overwrite = getattr(options, "overwrite", False)
@@ -51,7 +51,7 @@ def fast_fmu(options: argparse.Namespace) -> Path:
     try:
         return _default_arm(options.verb, native=True)
     except BuildError as error:
-        say(f"{error}; running the Python flavour, which is slower", error=True)
+        say(f"{error}; running the Python FMU, which is slower", error=True)
         return _default_arm(options.verb)
 
 

@@ -1,4 +1,4 @@
-"""Verb info: show the contents of an FMU, a bag or a sweep."""
+"""Verb info: show the contents of an FMU, a system, a bag or a sweep."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ OF_A_RUN: Table = {
     "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="storage plugin of the bag (mcap)"),
     "--compress": dict(choices=("zstd",), default="", help="compress the chunks of an MCAP bag"),
     "--scene": dict(action="store_true", help="record robot description, tf, target and end effector"),
-    "--meshes": dict(action="store_true", help="record a scene with the real meshes, kept in the bag's folder"),
+    "--meshes": dict(action="store_true", help="record a scene with the robot's meshes, stored in the bag's folder"),
     "--effort": dict(action="store_true", help="record the control effort"),
     "--stamp-start": dict(type=float, metavar="S", help="time stamp of the first sample, s since the epoch (now)"),
     "--overwrite": dict(action="store_true", help="replace an existing bag, or the FMU of a URDF"),
@@ -132,7 +132,7 @@ OPTIONS: Table = {
         action="append",
         default=[],
     ),
-    "--robot": dict(default="", metavar="NAME", help="component of an SSP file that is the robot"),
+    "--robot": dict(default="", metavar="NAME", help="component of a system (SSP file) that is the robot"),
     "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's default)"),
     "--namespace": dict(default="", metavar="NS", help="namespace of the topics"),
@@ -162,7 +162,7 @@ def add_output(parser: Parser, metavar: str, text: str, kind: Callable[[str], st
 
 def add_robot_options(parser: Parser) -> None:
     """Add the options for the robot of a third-party bag."""
-    parser.add_argument("--urdf", type=not_empty, metavar="U", help="URDF of the robot, for a bag without one")
+    parser.add_argument("--urdf", type=not_empty, metavar="FILE", help="URDF of the robot, for a bag without one")
     text = "end-effector link in this URDF"
     parser.add_argument("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
 

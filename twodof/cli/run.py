@@ -31,7 +31,7 @@ def add(run: Parser) -> None:
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "folder of the bag (rosbag2_<date and time>)")
     add_options(run, "--stop-time", "--step")
-    run.add_argument("--measured", action="store_true", help="record what sensors measure, and the true joint states")
+    run.add_argument("--measured", action="store_true", help="record the measured joint states, and the true ones")
     run.add_argument("--signals", action="store_true", help="record all real outputs of all FMUs")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run, "TwoDof.fmu, built if it is missing", "FMU|SSP|URDF")

@@ -32,7 +32,7 @@ def is_interrupt(error: ImportError | OSError) -> bool:
     """Return whether an error is a consequence of Ctrl-C.
 
     An OSError is a consequence if Ctrl-C came while a file was closed: the second close fails. ``shutil.rmtree``, which
-    removes the folder of an unzipped FMU, fails likewise.
+    removes the folder of an unzipped FMU, fails in the same way.
     """
     if isinstance(error, ImportError):
         return bool(_interrupts)
@@ -67,7 +67,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
     try:
         yield is_asked
     except SimulationError as error:
-        if asked:  # the Python flavour discards an interrupted step
+        if asked:  # a Python FMU discards an interrupted step
             raise KeyboardInterrupt from error
         raise
     finally:

@@ -49,7 +49,7 @@ def add(sweep: Parser) -> None:
     option("--seed", type=int, metavar="S", help="seed of the random draws (0)")
     varied("--range", dest="ranges", metavar="NAME=LOW:HIGH", help="range of uniformly drawn values")
     add_options(sweep, "--stop-time", "--step", "--set")
-    add_output(sweep, "OUT", "default: sweep_<date and time>")
+    add_output(sweep, "OUT", "folder of the results (sweep_<date and time>)")
     flag("--resume", help="continue the sweep in OUT without repeating finished runs")
     flag("--bags", help="keep a bag of each run in OUT/bags")
     option("--workers", type=int, metavar="N", help="number of local processes (one per core)")

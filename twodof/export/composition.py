@@ -98,8 +98,7 @@ def _flavour(
     if not options.native:
         if options.platforms or options.fmi not in (None, 2) or not options.arrays:
             raise BuildError(
-                "the platforms, the version of FMI and its arrays can be chosen for the native"
-                " flavour only, `native=True`"
+                "the platforms, the version of FMI and its arrays can be chosen for native FMUs only, `native=True`"
             )
         return python_flavour(options, robot, urdf, starts)
     if options.link_environment:

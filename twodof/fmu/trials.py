@@ -210,7 +210,7 @@ def variable_steps(trial: Trial) -> str:
     if not isfinite(away):
         raise SimulationError("with variable steps an output is not finite")
     steps = f"steps of {min(sizes):g} to {max(sizes):g} times {h:g} s"
-    return f"{steps}; outputs end at most {away:.2g} from those of equal steps"
+    return f"{steps}; final outputs are within {away:.2g} of those of equal steps"
 
 
 def inputs(trial: Trial) -> str:

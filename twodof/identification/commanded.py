@@ -1,4 +1,4 @@
-"""Efforts that a control law commanded, for bags without efforts, and between held targets."""
+"""Efforts that a control law commanded, for bags without efforts and at changes of held targets."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ SAME = 1e-6  # largest difference of recorded efforts from those of the law, as 
 def with_efforts(recording: Recording, options: FmuOptions) -> Recording:
     """Return a recording with efforts in the middle of each change of inputs.
 
-    At a change, the efforts before and after it differ, and positions around this sample are due to both. A run
-    records the effort before it. If it has the law's efforts, the mean of both replaces them, and also if it has none.
+    A run records the effort before a change, but the positions around it are due to the efforts before and after it.
+    Therefore the mean of both, by the control law, replaces a recorded effort of the law or a missing one.
 
     Args:
         recording: a bag's recording.
@@ -79,7 +79,7 @@ def commanded_efforts(recording: Recording) -> Array:
 
 
 def _of_commands(recording: Recording, options: FmuOptions) -> Recording:
-    """Return the part of a recording between its commands, with the efforts of joint control, or those commanded."""
+    """Return the part of a recording between its commands, with the efforts of joint control, or the commanded ones."""
     name = recording.path
     with TemporaryDirectory() as folder:
         try:

@@ -118,7 +118,9 @@ class Fit:
         """Cells of the table: name, before, after, 95 % interval, unit."""
         rows = [("parameter", "before", "after", "95 % interval", "unit")]
         for p in self.parameters:
-            interval = f"{p.low:.4g} … {p.high:.4g}" if p.known else ("not seen" if self.converged else "not known")
+            interval = (
+                f"{p.low:.4g} … {p.high:.4g}" if p.known else ("not determined" if self.converged else "not known")
+            )
             rows.append((p.name, f"{p.before:.4g}", f"{p.after:.4g}", interval, p.unit))
         return rows
 
@@ -129,7 +131,7 @@ class Fit:
         if self.unseen:
             short = sorted(self.unseen, key=len)[:MOST_COMBINATIONS]
             more = len(self.unseen) - len(short)
-            rest = f"; and {more} more combinations, which fit.json lists" if more else ""
+            rest = f"; fit.json lists {more} more combinations" if more else ""
             lines.append(f"the data do not determine: {'; '.join(short)}{rest}")
         for joint, unit, before, after in zip(self.joints, self.units, self.deviation_before, self.deviation):
             lines.append(
@@ -155,18 +157,20 @@ class Fit:
         lines += map(self._rest, self.holds)
         for name, t in self.jumps.items():
             lines.append(
-                f"the effort of joint '{name}' jumps between samples, most at {t:.4g} s: its course there is"
+                f"the effort of joint '{name}' jumps between samples, most at {t:.4g} s: its values between them are"
                 " unknown, and the intervals are too narrow; record at a higher rate, or a smoother motion"
             )
         if not lines:
             lines.append("the model explains these data: its residuals are noise")
         groups = {parameter.name.partition(":")[0] for parameter in self.parameters}
         if "gain" in groups and "mass" not in groups:
-            lines.append("gains are right only if the URDF's masses are: free 'mass:*' too, or weigh the robot")
+            lines.append(
+                "a fitted gain is right only if the URDF's masses are right: also free 'mass:*', or weigh the robot"
+            )
         if moved := [name for name, most in self.fragile.items() if most > FRAGILE]:
             lines.append(
-                f"too small for these data to show, constant errors of efforts could move {', '.join(moved)} by"
-                f" {max(self.fragile.values()):.2g} standard deviations: free 'bias:*' if there may be some"
+                f"constant errors of efforts could move {', '.join(moved)} by {max(self.fragile.values()):.2g} standard"
+                " deviations, and be too small to show in these data: free 'bias:*' if there may be such errors"
             )
         if abs(self.delay[0]) > 5.0 * self.delay[1]:
             side = "after" if self.delay[0] > 0.0 else "before"
@@ -177,9 +181,9 @@ class Fit:
         """Return the line on a model whose residuals are not noise, worst at one joint."""
         joint, unit = self.joints[worst.joint], self._effort_unit(worst.joint)
         narrow = ", and the intervals are too narrow" * (not self.suspects)
-        verdict = f"explains these data only roughly{narrow}, most"
+        verdict = f"explains these data only roughly{narrow}, worst"
         if worst.part > UNEXPLAINED:
-            verdict = "does not explain these data, least"
+            verdict = "does not explain these data, worst"
         return (
             f"the model {verdict} at joint '{joint}': slow residuals of {worst.rms:.3g} {unit},"
             f" {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the variance of fast ones; free"
@@ -212,8 +216,8 @@ class Fit:
             }
             found.append(ERRORS[group].format(name=name, joint=joint, size=size, **words))
         return (
-            f"the residuals look like {', or '.join(found)}; if it is that, correct it: the intervals allow for it."
-            " A wrong mass or centre of a link that is not free can look alike, and the intervals do not allow for it"
+            f"the residuals look like {', or '.join(found)}; if it is the cause, correct it: the intervals include its"
+            " effect, but not that of a wrong mass or centre of a link that is not free, which can look the same"
         )
 
     def _effort_unit(self, joint: int) -> str:

@@ -202,7 +202,7 @@ class Parameters:
         return np.array([10 * body + k for body in sorted(bodies - {-1}) for k in range(10)], np.int64)
 
     def with_errors(self, x: Array) -> tuple[Parameters, Array, NDArray[np.bool_]]:
-        """Free all of OF_THE_SETUP, too; return these parameters, coordinates, and which of them are new."""
+        """Free all of OF_THE_SETUP in addition; return the parameters, their coordinates, and which of them are new."""
         more = copy(self)
         more.free = [free for _, free in self._known() if free in self.free or free.group in OF_THE_SETUP]
         new = np.concatenate([np.full(free.size, free not in self.free) for free in more.free])

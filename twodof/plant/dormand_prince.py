@@ -1,6 +1,6 @@
 """One step of Dormand–Prince 5(4), or of Heun's method, and its interpolant.
 
-Coefficients, error norm and dense output of the former are those of SciPy's ``RK45``.
+Coefficients, error norm and dense output of Dormand–Prince are those of SciPy's ``RK45``.
 Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986.
 """
 

@@ -73,7 +73,7 @@ def first_zero(distance: float, v: float, a: float) -> float:
 def expected_event(
     y: State, rates: State, stops: Stops, grips: Sequence[float], grip_rates: Sequence[float], most: float
 ) -> float:
-    """Return when a joint is expected to stop or to be released, s; infinity if after ``most``.
+    """Return when a joint is expected to stop or to be released, s; infinity if later than ``most``.
 
     A constant acceleration stops it at a limit or by friction; changes of efforts, at the rates at the end of the last
     regime, release it.

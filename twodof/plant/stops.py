@@ -233,7 +233,7 @@ class Stops:
         return (inf, high) if above else (low, inf)
 
     def _stays(self, i: int) -> bool:
-        """Return whether no change of the efforts changes how a held joint without a range acts on the others."""
+        """Return whether a held joint without a range acts on the others in the same way under all efforts."""
         return self.rigid or (self.rest[i] == CLAMPED and not self.slip[i])
 
     def _has_no_range(self, i: int) -> bool:

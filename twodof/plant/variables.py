@@ -1,4 +1,4 @@
-"""The table of FMI variables, the source of the slave and of both flavours' XML.
+"""The table of FMI variables, from which native and Python FMUs have their variables and descriptions.
 
 Names are FMI structured names with 1-based indices. The value reference of a variable is its 1-based index in the
 table.
@@ -272,7 +272,7 @@ def variable_table(
 
 
 def free_table(table: Sequence[Variable], free: Collection[str], links: Sequence[Variable] = ()) -> list[Variable]:
-    """Return the table with groups of parameters, and then values of links, as further inputs behind the others."""
+    """Return the table with groups of parameters, and then values of links, as further inputs after the others."""
     rest = [variable for variable in table if variable.group not in free]
     first = next(i for i, variable in enumerate(rest) if variable.causality == "output")
     inputs = [replace(variable, causality="input") for variable in table if variable.group in free]

@@ -168,7 +168,7 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
 
 @contextmanager
 def _explaining(judge: Judge) -> Iterator[None]:
-    """Add the first cause that the samples show to the error of a run that a step ended."""
+    """Add the first cause that the samples show to the error of a failed step."""
     try:
         yield
     except SimulationError as error:

@@ -18,13 +18,13 @@ from .remedies import Repetition
 from .setup import robot_of
 from .stepping import Stop, judge_of, stepped
 
-MOST_STEPS = 5000  # communication steps of a run that is repeated
+MOST_STEPS = 5000  # communication steps, the most of a run that is repeated
 BUDGET = 6e7  # evaluations times joints in all repetitions of a run, about 5 s: independent of the machine's load
 TOO_LONG = "the run takes too long"
 
 
 def is_repeatable(run: Experiment) -> bool:
-    """Return whether a run is short, and of native FMUs of this package, which have no effects outside."""
+    """Return whether a run can be repeated: it is short, and its native FMUs of this package have no side effects."""
     parts = run.fmu.components.values() if isinstance(run.fmu, System) else [run.fmu]
     return run.steps <= MOST_STEPS and all(fmu.is_native for fmu in parts)
 
