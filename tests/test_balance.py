@@ -194,7 +194,7 @@ def test_an_input_that_changed_late_is_named(recovered: bool, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("settings", "rows", "words"),
     [
-        ({"Kp": 5.0}, [(4.9, {"v_des[1]": 1e-4})], "still approach, with a time constant of 7.97 s"),
+        ({"Kp": 5.0}, [(4.9, {"v_des[1]": 1e-4})], "still approach their targets, with a time constant of 7.97 s"),
         ({}, [(0.01 * k, {"tau_ext[1]": 0.3 * np.sin(0.06 * k)}) for k in range(1, 500)], "does not know tau_ext"),
         ({"Kp": 0.0}, [(4.8, {"Kp[1]": 50.0, "Kp[2]": 50.0})], "Kp[1] changed from 0 to 50 at 4.8 s"),
     ],

@@ -265,7 +265,7 @@ def test_messages_of_the_fmu_go_to_logging(native_path, caplog):
 
 
 def test_a_target_in_millimetres_is_doubted_before_the_run_and_where_it_fails(native_path, caplog):
-    question = "the target x_des is 205.9 m from the end effector; is it in millimetres?"
+    question = "the target x_des is 205.9 m from the end effector; is the target in millimetres?"
     with pytest.raises(SimulationError, match=re.escape(question)):  # hypot(200, 50) m, less the pose at the start
         twodof.simulate(native_path, stop_time=0.01, settings={"x_des": (200.0, 50.0), "max_step": 1e-9})
     assert question in caplog.text

@@ -87,7 +87,7 @@ def test_the_error_without_the_first_cause_is_that_of_a_run_without_it(
 
 def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
     first = twodof.simulate(fmus["task"], stop_time=1.0).verdict.lines[0]
-    left, tried, size = re.findall(r"about ([\d.]+) s more \(after ([\d.]+) s: ([\d.e-]+) m\)", first)[0]
+    left, tried, size = re.findall(r"about ([\d.]+) s more \(after ([\d.]+) s: error ([\d.e-]+) m\)", first)[0]
     assert float(tried) == pytest.approx(1.0 + float(left), abs=0.01)
     assert float(size) <= 0.02 * twodof.simulate(fmus["task"], stop_time=1.0).judge.aims["x"].first
 
@@ -99,7 +99,7 @@ def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
         (
             "task",
             {"x_des": (1.0, 0.05), "payload": 0.3},
-            ["out of reach by 0.7012 m", "payload of 0.3 kg", "^without both causes: 0.000"],
+            ["out of reach by 0.7012 m", "payload of 0.3 kg", "^without both causes: error 0.000"],
         ),
         # a load that moves joints without a gain: the gain alone cures nothing
         ("joint", {"q_des": (0.9, 0.8), "Kp": 0.0, "f_ext": (0.0, -0.93, 0.0)}, ["know f_ext", "also Kp = 0"]),
@@ -129,7 +129,11 @@ def test_the_remaining_time_is_tried(fmus: dict[str, Path]) -> None:
         (
             "pose",
             {"x_des": (0.4, 0.1, 0.4), "quat_des": (0.3, 0.9, 0.1, 0.2), "payload": 0.2, "Kp_rot": 5.0},
-            ["the orientation still approaches.*: 0.0103 m and 0.0484 rad", "", "payload.*: 0.000181 m and 0.583 rad"],
+            [
+                "the orientation still approaches.*: error 0.0103 m and 0.0484 rad",
+                "",
+                "payload.*: error 0.000181 m and 0.583 rad",
+            ],
         ),
     ],
 )
@@ -144,8 +148,8 @@ def test_several_causes_are_ranked_by_the_errors_without_each(fmus: dict[str, Pa
     ("fmu", "settings", "first"),
     [
         # friction holds a joint, and gains damp too little; the payload has nearly all of the error
-        ("system", {"plant.payload": 0.3, "friction": 0.1, "Kd": 0.3}, "payload of 0.3 kg .if it is known: 0.0"),
-        ("task", {"q_min": (-0.2, -3.0), "payload": 0.05}, "payload of 0.05 kg .if it is known: 0.09"),
+        ("system", {"plant.payload": 0.3, "friction": 0.1, "Kd": 0.3}, "payload of 0.3 kg .if it is known: error 0.0"),
+        ("task", {"q_min": (-0.2, -3.0), "payload": 0.05}, "payload of 0.05 kg .if it is known: error 0.09"),
         # a noisy encoder with a small payload
         (
             "joint",
@@ -161,16 +165,16 @@ def test_settings_that_the_forces_at_the_end_do_not_show_are_tried(fmus: dict[st
 def test_the_first_cause_does_not_depend_on_the_communication_step(fmus: dict[str, Path]) -> None:
     settings = {"x_des": (1.0, 0.05), "payload": 0.3}
     lines = [twodof.simulate(fmus["task"], settings=settings, step=step).verdict.lines for step in (0.01, 0.001)]
-    assert all("out of reach by 0.7012 m (with a target in reach: 0.231 m)" in line[0] for line in lines)
-    assert all("(if it is known: 0.701 m)" in line[1] for line in lines)
-    assert all(line[2].startswith("without both causes: 0.000") for line in lines)
+    assert all("out of reach by 0.7012 m (with a target in reach: error 0.231 m)" in line[0] for line in lines)
+    assert all("(if it is known: error 0.701 m)" in line[1] for line in lines)
+    assert all(line[2].startswith("without both causes: error 0.000") for line in lines)
 
 
 def test_a_load_that_changes_is_absent_from_the_start(fmus: dict[str, Path], tmp_path: Path) -> None:
     """The last change would otherwise leave the torque before it."""
     (tmp_path / "a.csv").write_text("time,tau_ext[1],tau_ext[2]\n1,1,0.2\n4,0,0.2\n")
     verdict = twodof.simulate(fmus["joint"], settings={"q_des": (0.9, 0.8)}, input_file=tmp_path / "a.csv").verdict
-    assert "(without it: 0.00073 rad)" in verdict.lines[0]
+    assert "(without it: error 0.00073 rad)" in verdict.lines[0]
 
 
 def test_gains_that_are_far_too_slow_are_not_tried_for_hours(fmus: dict[str, Path]) -> None:
@@ -199,17 +203,17 @@ def test_causes_that_keep_the_error_only_together_are_all_named(fmus: dict[str, 
         for one in ({"tau_ext": 0.0}, {"friction": 0.0}, {"tau_ext": 0.0, "friction": 0.0})
     )
     text = str(twodof.simulate(fmus["joint"], settings=both).verdict)
-    assert f"(without friction: {smooth:.3g} rad" in text and f"(without it: {still:.3g} rad" in text
-    assert f"\nwithout both causes: {without:.3g} rad\n" in text
+    assert f"(without friction: error {smooth:.3g} rad" in text and f"(without it: error {still:.3g} rad" in text
+    assert f"\nwithout both causes: error {without:.3g} rad\n" in text
     assert still > 0.4 and smooth > 0.4 and without < 1e-3
 
 
 def test_what_follows_from_degrees_is_a_note(fmus: dict[str, Path]) -> None:
     lines = twodof.simulate(fmus["joint"], settings={"q_des": (90.0, 0.8)}).verdict.lines
-    assert "q_des[1] is 90 rad (read as degrees: 0.00174 rad); did you mean 90°, which is 1.5708 rad?" in lines[0]
+    assert "q_des[1] is 90 rad (read as degrees: error 0.00174 rad); did you mean 90°, which is 1.5708 rad?" in lines[0]
     assert lines[1].startswith("note: joint 'joint1' stood at its upper limit")
     both = twodof.simulate(fmus["joint"], settings={"q_des": (45.0, 40.0)}).verdict.lines
-    assert "did you mean 45°, which is 0.7854 rad; likewise 'joint2'?" in both[0]
+    assert "did you mean 45°, which is 0.7854 rad; the same for 'joint2'?" in both[0]
     assert not any(line.startswith("also joint") for line in both)
 
 
@@ -236,7 +240,7 @@ def test_a_limit_on_the_way_of_a_moving_target_is_named(fmus: dict[str, Path], t
     follow = partial(twodof.simulate, fmus["task"], stop_time=6.0, input_file=tmp_path / "circle.csv")
     assert follow().verdict.outcome == "followed"
     first = follow(settings={"q_max": (3.0, 1.6)}).verdict.lines[0]
-    assert "'joint2' stood at its upper limit 1.6 rad" in first and "without limits of the joints: 0.000" in first
+    assert "'joint2' stood at its upper limit 1.6 rad" in first and "without joint limits: error 0.000" in first
 
 
 class Steering(twodof.Sink):
@@ -290,7 +294,7 @@ def test_a_bag_has_the_errors_without_the_causes(
     assert main(["run", str(fmus["task"]), "--set", "payload=0.3", "-o", str(bag)]) == 0
     printed = capsys.readouterr().out
     assert main(["info", str(bag)]) == 0
-    line = "(if it is known: 0.000224 m); set payload_known=true"
+    line = "(if it is known: error 0.000224 m); set payload_known=true"
     assert line in printed and line in capsys.readouterr().out
     assert twodof.verdict(bag).causes[0].removes == pytest.approx(1.0, abs=0.01)
 
@@ -312,7 +316,7 @@ def test_a_number_of_a_joint_that_the_largest_error_hides_is_named(fmus: dict[st
     cured = twodof.simulate(fmus["joint"], settings={**settings, "Kd": (2.0 * 50.0**0.5, 40.0)})
     first, second = (abs(wanted - q) for wanted, q in zip((0.9, 0.8), cured.last.q))
     texts = re.findall(
-        r"with critical damping: ([\d.e-]+) rad of joint 'joint2', ([\d.e-]+) rad of joint 'joint1'", lines[1]
+        r"with critical damping: error ([\d.e-]+) rad of joint 'joint2', ([\d.e-]+) rad of joint 'joint1'", lines[1]
     )
     assert [*map(float, texts[0])] == pytest.approx([second, first], rel=6e-3), lines
 
@@ -329,7 +333,7 @@ def test_a_cause_that_acts_without_the_first_one_is_no_note(fmus: dict[str, Path
     lines = twodof.simulate(fmus["joint"], settings=settings).verdict.lines
     cured = twodof.simulate(fmus["joint"], settings={**settings, **without})
     assert "payload" in lines[0] and lines[1].startswith("also joint"), lines
-    assert float(re.findall(r"\nwithout both causes: ([\d.e-]+) rad\n", "\n".join(lines))[0]) == pytest.approx(
+    assert float(re.findall(r"\nwithout both causes: error ([\d.e-]+) rad\n", "\n".join(lines))[0]) == pytest.approx(
         error(cured), rel=6e-3
     )
 
@@ -339,7 +343,7 @@ def test_gains_that_need_longer_than_ten_runs_are_tried_with_the_usual_ones(fmus
     first = twodof.simulate(fmus["pose"], settings=target).verdict.lines[0]
     cured = twodof.simulate(fmus["pose"], settings={**target, "Kp_rot": 50.0})
     texts = re.findall(
-        r"still approaches.* about \d+ s more \(with Kp_rot = 50: ([\d.e-]+) rad\); raise Kp_rot, or", first
+        r"still approaches.* about \d+ s more \(with Kp_rot = 50: error ([\d.e-]+) rad\); raise Kp_rot, or", first
     )
     assert texts, first
     assert float(texts[0]) == pytest.approx(cured.turn_error, rel=6e-3)
@@ -373,7 +377,7 @@ def test_the_advice_to_raise_a_gain_is_tried(fmus: dict[str, Path], fmu, setting
     first = twodof.simulate(fmus[fmu], settings=settings).verdict.lines[0]
     gains = {"Kp": 10.0 * settings.get("Kp", 50.0), "Kd": 10.0**0.5 * 40.0}
     stiffer = twodof.simulate(fmus[fmu], settings={**settings, **gains})
-    advice = re.findall(r"raise Kp \(with Kp = (\d+) and Kd = 126.5: ([\d.e-]+) (?:m|rad)\)", first)
+    advice = re.findall(r"raise Kp \(with Kp = (\d+) and Kd = 126.5: error ([\d.e-]+) (?:m|rad)\)", first)
     assert ("raise Kp" in first) == helps, first
     if helps:
         assert [*map(float, advice[0])] == [gains["Kp"], pytest.approx(error(stiffer), rel=6e-3)]
@@ -385,7 +389,7 @@ def test_joints_that_creep_are_named_apart_from_joints_that_stick(fmus: dict[str
     joints = summary.judge.setup.joints
     moving = {name for name, v in zip(joints, summary.last.v) if v}
     assert {*re.findall(r"'(\w+)'", creeps)} == moving and 0 < len(moving) < 7
-    named = {*re.findall(r"'(\w+)'", sticks.partition(" sticks")[0][-20:] + sticks.partition("likewise")[2])}
+    named = {*re.findall(r"'(\w+)'", sticks.partition(" sticks")[0][-20:] + sticks.partition("the same for")[2])}
     assert named == {*joints} - moving
     assert "without friction" in sticks and "without friction" not in creeps  # the same run
 

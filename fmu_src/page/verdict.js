@@ -54,7 +54,7 @@ export class Verdict {
       if (each.joint < 0) return [each];
       const names = same.length === this.joints.length && same.length > 2 ? "all other joints"
         : same.slice(1).map(({ joint }) => `'${this.joints[joint].name}'`).join(", ");
-      const text = each.text.replace(/\??$/, (end) => (names && `; likewise ${names}`) + end);
+      const text = each.text.replace(/\??$/, (end) => (names && `; the same for ${names}`) + end);
       return each === same[0] ? [{ ...each, text }] : [];
     });
   }
@@ -154,8 +154,8 @@ export class Verdict {
     if (!far && !waited) return outside;
     const { point, distance } = this.search.nearest(wanted);
     if (distance <= Math.max(BAND * this.way[0], FLOOR)) return outside;
-    const millimetres = Math.max(...wanted.map(Math.abs)) > 10 ? "; is it in millimetres?" : "";
-    const text = `target out of reach by ${short(distance)} m${millimetres}; the nearest reachable point is (${point.map(short).join(", ")}) m`;
+    const millimetres = Math.max(...wanted.map(Math.abs)) > 10 ? "; is the target in millimetres?" : "";
+    const text = `target out of reach by ${short(distance)} m; the nearest reachable point is (${point.map(short).join(", ")}) m${millimetres}`;
     return [cause("reach", text, distance)];
   }
 
@@ -321,7 +321,7 @@ export class Verdict {
     const { session } = this, rates = [0, 1].map((i) => slowest(session, i)), last = session.count - 1;
     const left = -Math.log(BAND) / Math.min(...rates) - (session.time(last) - session.time(this.began));
     const settings = ["control_period", "control_delay"].filter((name) => Number(session.values.get(name) ?? 0) > 0);
-    if (left > PATIENCE) return [cause("time", `with these gains an error takes about ${short(left)} s more to 2 %`, left)];
+    if (left > PATIENCE) return [cause("time", `with these gains the error is within 2 % after about ${short(left)} s more`, left)];
     const coarse = this.joints.flatMap((_, i) => ["q_resolution", "q_noise", "v_noise"].map((name) => `${name}[${i + 1}]`)).filter((name) => Number(session.values.get(name) ?? 0) > 0);
     if (coarse.length) return [cause("sampling", `the controller measures with ${coarse[0]} = ${short(Number(session.values.get(coarse[0])))}: it does not see smaller errors`)];
     return left <= 0 && settings.length ? [cause("sampling", `the motion does not settle: ${settings.join(" and ")} make the efforts too late`)] : [];
@@ -336,8 +336,8 @@ export class Verdict {
       const size = late.map((k) => this.errors(k)[i]), rate = Math.min(Math.log(size[0] / size[end]) / passed, most[i]);
       const left = Math.log(Math.max(size[end] / Math.max(BAND * this.way[i], FLOOR), 1)) / rate;
       const falls = is && end > 1 && size[end] > 0 && rate * passed > 1e-6 && size.every((value, k) => !k || value < size[k - 1]);
-      const what = i ? "orientation still approaches" : session.groups.has("q_des") ? "joints still approach" : "position still approaches";
-      return falls && left > PATIENCE && left < 5000 * passed ? [cause("time", `the ${what}: 2 % takes about ${short(left)} s more, or ${over ? "raise Kp" : "raise the gains"}`, left)] : [];
+      const what = i ? "orientation still approaches its target" : session.groups.has("q_des") ? "joints still approach their targets" : "position still approaches its target";
+      return falls && left > PATIENCE && left < 5000 * passed ? [cause("time", `the ${what}: within 2 % after about ${short(left)} s more, or ${over ? "raise Kp" : "raise the gains"}`, left)] : [];
     });
   }
 }

@@ -63,7 +63,7 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
         "curves": _curves(rows, bags),
     }
     gaps = bool(rows[metrics].isna().any(axis=None))
-    key = "; ".join(["circle: the run below", *[CROSSES] * beyond.any(), *[HOLLOW] * gaps])
+    key = "; ".join(["circle: the run below", *[CROSSES] * bool(beyond.any()), *[HOLLOW] * gaps])
     return f'<p>{key}</p>\n<div id="maps"></div>\n{figures_html(content, "maps.js")}'
 
 

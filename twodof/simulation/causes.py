@@ -45,7 +45,7 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
 
         parts, static = parts_of_error(judge, missed)
         found += [*_reach(judge, missed), *gains(judge, missed), *feedforward(judge, missed), *load(judge)]
-        sticking = [*_friction(judge, missed, parts)]  # without parts, the rate of an error then tells nothing
+        sticking = [*_friction(judge, missed, parts)]  # the rate of an error needs parts if joints stick
         reach = max((cause.share for cause in found if cause.kind == "reach"), default=0.0)
         static = {name: max(size, reach) for name, size in static.items()}
         changed = [*late_change(judge)] if _explains(judge, missed) else []
@@ -62,14 +62,14 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     if not ranked:
         return ()
     root, *others = ranked[:MOST]
-    return root._replace(noted=bool(missed) and root.kind in MOTION), *others  # a peak makes no error
+    return root._replace(noted=bool(missed) and root.kind in MOTION), *others  # a peak does not cause an error
 
 
 def _explains(judge: Judge, missed: Sequence[str]) -> bool:
     """Return whether most of the error before the latest change of inputs was due to these inputs."""
     if judge.latest is None or not missed:
         return False
-    from .balance import parts_of_error  # as above
+    from .balance import parts_of_error  # SciPy takes half a second to import
 
     t, changes = judge.latest
     groups = {name.partition("[")[0] for name, (old, new) in changes.items() if abs(new - old) >= LASTING * abs(old)}
@@ -97,7 +97,7 @@ def _by_parts(
     bounds = limits + _weight("singularity", "", parts)
     loads = [_weight("load", cause.subject, parts) for cause in found if cause.kind == "load"]
     grown = bool(missed) and all(judge.aims[name].last > judge.aims[name].first for name in missed)
-    thrown = grown and min(loads, default=0.0) <= -LASTING and max(loads) < LASTING  # no time makes an error grow
+    thrown = grown and min(loads, default=0.0) <= -LASTING and max(loads) < LASTING  # it grows in a longer run
 
     def weight(cause: Cause) -> float:
         if cause.kind == "reach":
@@ -105,7 +105,7 @@ def _by_parts(
         own = _weight(cause.kind, cause.subject, parts)
         at_limit = bounds >= LASTING and abs(limits + own) < LASTING
         if cause.kind == "load" and own <= -LASTING and (thrown or at_limit):
-            return max(bounds, _weight("time", "", parts)) + LASTING  # it moved the arm there, and now acts away
+            return max(bounds, _weight("time", "", parts)) + LASTING  # it moved the arm there, and now pulls it away
         if cause.kind in ("unstable", "sampling"):
             net = bounds + min(0.0, parts.get(("sampling", ""), 0.0))  # a stop also balances wrong efforts
             left = net - beyond if beyond > SMALL else bounds
@@ -128,7 +128,7 @@ def _by_parts(
         if first or cause.kind in MOTION or opposed or (most >= SMALL and abs(own) >= SMALL):
             after = inf if cause.kind in MOTION or opposed else -round(most, 1)
             after = -inf if cause.kind == "reach" and most >= LASTING else after
-            known = cause.kind not in MOTION and not first and most == measured  # not by a rule of the order
+            known = cause.kind not in MOTION and not first and most == measured  # and not a value for the order alone
             cause = cause._replace(noted=opposed or cause.kind in MOTION, part=most if known else None)
             ranked.append(((not first, after, [*KINDS].index(cause.kind), -own, -cause.share), cause))
     causes = [cause for _, cause in sorted(ranked, key=itemgetter(0))]
@@ -203,10 +203,10 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             wide = search(quat=np.empty(0), low=-free, high=free, q=best.q)
             stops = ", ".join(f"'{name}'" for name, at in zip(setup.joints, near) if at)
             text += f" within the joint limits ({stops})" if wide.distance < size else ""
-        if np.abs(target).max() > MILLIMETRES and np.linalg.norm(0.001 * target - best.point[axes]) < best.distance:
-            text += "; is it in millimetres?"
         text += f"; the nearest reachable point is {point_text(best.point[axes])} m"
         text += f", {gap:.4g} m from the end effector" * (gap > size)
+        if np.abs(target).max() > MILLIMETRES and np.linalg.norm(0.001 * target - best.point[axes]) < best.distance:
+            text += "; is the target in millimetres?"
         part = _part_of(judge, missed, "x", target - best.point[axes])
         yield Cause("reach", text, best.distance, point=tuple(best.point.tolist()), part=part)
     elif quat.size:
@@ -243,7 +243,7 @@ def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def _driven(judge: Judge) -> set[str]:
-    """Return the joints that the controller pulls away from the nearer limit at the end: another cause drives them."""
+    """Return the joints that the controller pulls away from the nearer limit at the end: another cause holds them."""
     setup, q = judge.setup, judge.end("q")
     pull = judge.wanted("q") - q if judge.wanted("q").size else np.zeros(len(q))
     if _chain(judge) and not judge.wanted("quat").size:
@@ -323,5 +323,5 @@ def _singular(judge: Judge) -> Iterator[Cause]:
     late, at = ratio[judge.late], t[judge.late]
     k = int(late.argmin())
     if np.mean(late <= near) > OFTEN:
-        text = f"the arm is near a singularity: its singular values have the ratio {late[k]:.2g} at {at[k]:.4g} s"
+        text = f"the arm is near a singularity: σ_min/σ_max of its Jacobian is {late[k]:.2g} at {at[k]:.4g} s"
         yield Cause("singularity", text, 1.0 - float(late[k]), time=float(at[k]))

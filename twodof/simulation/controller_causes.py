@@ -242,7 +242,8 @@ def _unstable(judge: Judge, period: float, delay: float) -> Iterator[Cause]:
             state = f"the loop{'' if group else ' of the self-motion'} is unstable, "
             state += f"{'an error' if group else 'it'} doubles in {-log(2.0) / rate:.2g} s"
         elif group and rate < SPOILT * decay(loop) and log(1.0 / BAND) > rate * (judge.duration - judge.changed):
-            state = f"the loop is close to unstable, an error takes {log(1.0 / BAND) / max(rate, 1e-9):.2g} s to 2 %"
+            left = log(1.0 / BAND) / max(rate, 1e-9)
+            state = f"the loop is close to unstable, an error takes {left:.2g} s to decay to 2 %"
             state = state if rate > 1e-6 else "the loop is at its limit of stability, errors do not decay"
         else:
             continue
@@ -308,7 +309,7 @@ def damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def late_by(judge: Judge, rate: float) -> float:
-    """Return by how much an error that decays with a rate, 1/s, needs more time to 2 % than it has, s."""
+    """Return the additional time, s, in which an error with a rate of decay, 1/s, would reach 2 %."""
     return log(1.0 / BAND) / max(rate, 1e-9) - (judge.duration - judge.changed)
 
 

@@ -60,7 +60,7 @@ def without(judge: Judge, cause: Cause) -> Repetition | None:
             return plan("without this limit", {"limit_effort": False})
         case "limit":
             wide = _elements(held, "q_min", -UNBOUNDED) | _elements(held, "q_max", UNBOUNDED)
-            return plan("without limits of the joints", wide)
+            return plan("without joint limits", wide)
         case "unstable" | "sampling" if not own:
             exact = {name: type(value)(0) for name, value in held.items() if name.partition("[")[0] in SAMPLING}
             return plan("with a continuous controller and exact sensors", exact)
@@ -85,7 +85,7 @@ def _elements(held: Mapping[str, float], group: str, value: float) -> dict[str, 
 
 
 def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
-    """Return settings with which the controller knows a load, or without an external load, in words first."""
+    """Return the change in words, and settings with which the controller knows a load or an external load is absent."""
     own, held, links = controller_prefix(judge), judge.held, judge.setup.links
     if known := {name: value for name, value in links.items() if name.partition("[")[0] == subject}:
         return "with that of the model", known
@@ -100,7 +100,7 @@ def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
 
 
 def _in_radians(judge: Judge) -> dict[str, float]:
-    """Return large and whole positions of all joints, read as degrees, in rad."""
+    """Return positions of all joints in rad; large and whole numbers are read as degrees."""
     turning = [i + 1 for i, unit in enumerate(judge.setup.units) if unit == "rad"]
     values = {name: judge.held.get(name, 0.0) for i in turning for name in (f"q_des[{i}]", f"q_start[{i}]")}
     return {name: radians(value) for name, value in values.items() if abs(value) > TURN or value == round(value) != 0}

@@ -153,7 +153,8 @@ class _Trials:
 
     def _errors(self, result: Judge) -> str:
         """Return the errors of the missed outputs at the end of a repeated run in words."""
-        return " and ".join(self._error(result, name) for name in self._missed)
+        text = " and ".join(self._error(result, name) for name in self._missed)
+        return text if text.startswith("RMS") else f"error {text}"
 
     def _error(self, result: Judge, name: str) -> str:
         """Return an error in words: at the end, or else its RMS, if only that is smaller or larger than in the run."""

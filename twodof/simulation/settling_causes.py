@@ -31,11 +31,14 @@ def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> It
         band = max(BAND * aim.first, FLOOR)
         left = log(max(aim.last / band, 1.0)) / rate if rate else 0.0
         left += OF_THE_END * (judge.duration - judge.changed)  # the error must stay there
-        what = {name: f"the {output} still approaches" for name, output in (("x", "position"), ("quat", "orientation"))}
-        what["q"] = "the joints still approach"
+        what = {"x": "the position still approaches its target", "quat": "the orientation still approaches its target"}
+        what["q"] = "the joints still approach their targets"
         raised, approaches = stiff, what[name]
         if name == "q" and (i := _alone(judge)) is not None:
-            approaches, raised = f"joint '{judge.setup.joints[i]}' still approaches", gain_name(judge, stiff, i)
+            approaches, raised = (
+                f"joint '{judge.setup.joints[i]}' still approaches its target",
+                gain_name(judge, stiff, i),
+            )
             damp = gain_name(judge, damp, i)
         if rate and left < 1000.0 * judge.duration:
             late = f"the target changed at {judge.changed:.4g} s, and " if judge.changed > 0.0 else ""
@@ -44,7 +47,7 @@ def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> It
             if static.get(name, 0.0) > band:
                 text += ", and other causes keep an error"
             else:
-                text += f": 2 % takes about {left:.3g} s more"
+                text += f": within 2 % after about {left:.3g} s more"
                 remedy += ", or stop later"
             yield Cause("time", f"{text}; {remedy}", left, subject=stiff)
 
@@ -79,7 +82,7 @@ def unsettled(judge: Judge, moving: float, static: Mapping[str, float]) -> Itera
     settings = " and ".join(f"{name} = {judge.setup.starts[name]:g} s" for name in PERIODS if judge.held.get(name))
     if left > 0.0 and moving > 0.5:
         rests = any(rest > max(BAND * judge.aims[name].first, FLOOR) for name, rest in static.items())
-        text = f": with these gains it takes about {left:.3g} s more to 2 %; raise the gains, or stop later"
+        text = f": with these gains it is within 2 % after about {left:.3g} s more; raise the gains, or stop later"
         text = ", and other causes keep an error; stop later to see them" if rests else text
         yield Cause("time", f"the motion has not settled{text}", left)
     elif sensors:

@@ -249,7 +249,9 @@ def _too_large(run: Experiment, sample: Sample) -> str:
 def far_target(sample: Sample) -> str:
     """Return a question about a target that no robot of usual size reaches; "" for others."""
     away = dist(sample.x, sample.target) if sample.target else 0.0
-    return f"the target x_des is {away:.4g} m from the end effector; is it in millimetres?" if away > FAR else ""
+    return (
+        f"the target x_des is {away:.4g} m from the end effector; is the target in millimetres?" if away > FAR else ""
+    )
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:

@@ -96,7 +96,9 @@ def _grouped(why: tuple[Cause, ...], count: int, worst: str) -> list[Cause]:
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
             names = "all other joints" if len(joints) == count - 1 > 1 else names
             question = "?" * lead.text.endswith("?")
-            grouped.append(lead._replace(text=lead.text.rstrip("?") + f"; likewise {names}" * bool(names) + question))
+            grouped.append(
+                lead._replace(text=lead.text.rstrip("?") + f"; the same for {names}" * bool(names) + question)
+            )
     first = {cause.tried: cause for cause in reversed(grouped)}
     return [c if not c.tried or first[c.tried] is c else c._replace(tried="", part=None) for c in grouped]
 
