@@ -127,7 +127,20 @@ def test_points(native_path, tmp_path):
 def test_commands_in_memory_are_bounded(native_path, tmp_path, monkeypatch):
     bag = write_third_party(tmp_path / "bag", [("/goal", BEGIN + i, point(0, 0.1, 0.2)) for i in range(10)])
     monkeypatch.setattr(recorded_commands, "MAX_COMMANDS_SIZE", 1000)
-    with pytest.raises(InputError, match="more than 1000000 messages or 0 MiB of them on /goal"):
+    with pytest.raises(InputError, match=r"more than \d+ messages or 0 MiB of them on /goal; cut it"):
+        twodof.read_commands(native_path, bag)
+
+
+def test_the_number_of_commands_is_bounded_by_the_size_of_the_bag(native_path, tmp_path, monkeypatch):
+    """A command takes 0.08 ms, whereas a compressed one takes a few bytes; bags without compression are not refused."""
+    goals = [("/goal", BEGIN + i, point(0, 0.1, 0.2)) for i in range(30)]
+    bag = write_third_party(tmp_path / "bag", goals)
+    monkeypatch.setattr(recorded_commands, "MAX_FREE_COMMANDS", 0)
+    assert len(twodof.read_commands(native_path, bag)) == 30
+    monkeypatch.setattr(recorded_commands, "MIN_COMMAND_PACKED", 1000)
+    with pytest.raises(
+        InputError, match=r"more than \d messages or 384 MiB of them on /goal; cut it into several bags"
+    ):
         twodof.read_commands(native_path, bag)
 
 

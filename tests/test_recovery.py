@@ -315,6 +315,19 @@ def test_no_more_profiles_are_read_than_take_no_time(tmp_path, monkeypatch):
     assert read == profiles[:3]
 
 
+MERGED = "- &a0 {history: 1}\n" + "".join(f"- &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 20))
+LONG = "- {history: 1, depth: 0x" + "f" * 5000 + ", reliability: 1, durability: 1}"
+
+
+@pytest.mark.parametrize("profile", [MERGED, LONG], ids=["merge keys", "long number"])
+def test_profiles_that_yaml_cannot_read_in_time_are_left_out(tmp_path, profile):
+    """Merge keys of YAML take ten times as long with each line; Python does not print numbers of thousands of digits."""
+    (tmp_path / "bag").mkdir()
+    content = b"".join([HEADER, SCHEMA, channel(1, "/t", profile), message(bytes(4)), FOOTER])
+    (tmp_path / "bag/bag.mcap").write_bytes(content)
+    assert twodof.recover(tmp_path / "bag").counts == {"/t": 1}
+
+
 def test_messages_in_another_form_are_left_out_and_named(tmp_path):
     (tmp_path / "bag").mkdir()
     other = record(4, struct.pack("<HH", 2, 1), texts("/text", "json", ""))

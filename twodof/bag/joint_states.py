@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bounds import MAX_JOINT_STATE, MAX_NAME, MAX_ODD, MIB
+from ..bounds import MAX_JOINT_STATE, MAX_NAME, MAX_ODD, MIB, ODD
 from ..errors import BagError
 from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
 from ..ros.commands import deserialise
@@ -104,7 +104,7 @@ class JointStates:
 
     def _decode_one(self, message: Rows) -> tuple[str, list[Array]]:
         """Return the frame and the numbers of a message, whose joints must be those of the first message."""
-        self._odd += message.nbytes
+        self._odd += ODD + message.nbytes
         if self._odd > MAX_ODD:
             raise BagError(f"'{self._path}' has more than {MAX_ODD // MIB} MiB of joint states of changing form")
         state = deserialise(JOINT_STATE, message.tobytes())

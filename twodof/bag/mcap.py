@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..bounds import MAX_CHUNK, MAX_LOOSE, MAX_PROVENANCE, MAX_RATIO
 from ..ros.cdr import Rows
-from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, add_channel, refusing_damage
+from .records import BATCH, RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, add_channel, refusing_damage
 
 if sys.version_info >= (3, 14):
     from compression import zstd as zstd
@@ -97,9 +97,9 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
         budget.spend(RECORD)
         head = chunk[position : position + HEAD.size + 2]
         if opcode in (SCHEMA, CHANNEL):
+            budget.spend(TEXT * length + BATCH * len(waiting))
             yield from gathered()
             seen = {}
-            budget.spend(TEXT * length)
             tables.add(path, opcode, chunk, position + HEAD.size)
         elif opcode == MESSAGE and head in seen and not skips:
             turn = [offset for offset in seen.values() if offset >= seen[head]]

@@ -12,7 +12,18 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..bounds import CHANGE, MAX_COMMANDS, MAX_COMMANDS_SIZE, MAX_FOLLOWED, MAX_HELD, MAX_POINTS, MIB
+from ..bounds import (
+    CHANGE,
+    MAX_COMMANDS,
+    MAX_COMMANDS_SIZE,
+    MAX_FOLLOWED,
+    MAX_FREE_COMMANDS,
+    MAX_HELD,
+    MAX_POINTS,
+    MIB,
+    MIN_COMMAND_PACKED,
+    TRAJECTORY,
+)
 from ..errors import BagError, InputError
 from ..files import shown
 from ..fmu import Fmu, load_fmu
@@ -81,9 +92,10 @@ def read_commands(
     types = (*follows.types, *[JOINT_TRAJECTORY] * all(map(fmu.vector, (*FOLLOWING, "q_start"))))
     topics, begins, size = _messages(path, types, topic)
     chosen = _only(topics, path, topic, types)
-    if len(topics[chosen]) > MAX_COMMANDS or size > MAX_COMMANDS_SIZE:
-        most = f"{MAX_COMMANDS} messages or {MAX_COMMANDS_SIZE // MIB} MiB of them"
-        raise InputError(f"'{path}' has more than {most} on {shown(chosen)}")
+    most = _most(path, topics[chosen][0][1])
+    if len(topics[chosen]) > most or size > MAX_COMMANDS_SIZE:
+        limit = f"{most} messages or {MAX_COMMANDS_SIZE // MIB} MiB of them"
+        raise InputError(f"'{path}' has more than {limit} on {shown(chosen)}; cut it into several bags")
     commands = sorted(topics[chosen], key=lambda command: command[0])
     begin = min((t for name, t in begins.items() if name != chosen), default=commands[0][0])
     if len({kind == JOINT_TRAJECTORY for _, kind, _ in commands}) > 1:
@@ -148,6 +160,13 @@ def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict
     except (OSError, DamageError) as error:
         raise BagError(f"cannot read the bag '{path}': {error}") from error
     return topics, begins, size
+
+
+def _most(path: Path, kind: str) -> int:
+    """Return the largest number of commands of a type that are read from a bag, by the size of its files."""
+    packed = sum(file.stat().st_size for file in whole_bag(path))
+    most = min(MAX_COMMANDS, MAX_FREE_COMMANDS + packed // MIN_COMMAND_PACKED)
+    return most // TRAJECTORY if kind == JOINT_TRAJECTORY else most
 
 
 def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:

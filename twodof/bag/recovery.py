@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sqlite3
 from collections import Counter
@@ -35,6 +36,7 @@ from .records import Channel, DamageError, ReadBudget
 from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, McapStorage, check_path
 from .summary import read_summaries
 
+UNUSUAL = re.compile(r"[&*<]|\w{41}")  # YAML's references, which can grow without end, and no number of a profile
 NO_HASH = "RIHS01_" + "0" * 64  # hash of a type without a known definition
 
 
@@ -243,7 +245,7 @@ class _Topics:
         if text not in self._profiles:
             self._profiles[text] = []
             self._yaml += len(text)
-            if self._yaml < MAX_PROFILES:
+            if self._yaml < MAX_PROFILES and not UNUSUAL.search(text):
                 with suppress(ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError):
                     self._profiles[text] = parse_qos(text)
         return self._profiles[text]
