@@ -225,6 +225,17 @@ def nothing(positions: int, names: int) -> bytes:
     return serialised(joint_message(0, ["a"] * names, np.zeros(positions)))
 
 
+def framed(frame: str) -> bytes:
+    return message(serialised(joint_message(0, ["a"], [0.0], frame=frame)))
+
+
+def interrupted(first: bytes, second: bytes, times: int) -> bytes:
+    """An MCAP file of pairs of records in one chunk, and of 1 MB that permits it to unpack to a gigabyte."""
+    size = times * len(first + second)
+    ballast = record(0x90, np.random.default_rng(1).bytes(MIB))
+    return mcap_of(ballast, SCHEMA, CHANNEL, chunk(zipped(first + second, times), size, "zstd"))
+
+
 def channels(qos: str = "") -> list[bytes]:
     """Almost the largest number of channels, each with its own profile."""
     return [channel(i, f"/t{i}", f"{qos}{i}" if qos else "") for i in range(1, 1000)]
@@ -280,6 +291,8 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     "100,000 entries in an index": with_mcap(
         lambda: indexed(record(8, INDEX, struct.pack("<IHQ", 10, 1, 0)) * 100_000)
     ),
+    "a schema before each of 100,000 messages": with_mcap(lambda: interrupted(SCHEMA, message(nothing(1, 1)), 100_000)),
+    "joint states in two frames in turn": with_mcap(lambda: interrupted(framed("a"), framed("b"), 700_000)),
     "5 MB of entries that share their bytes": with_mcap(
         lambda: indexed(record(8, INDEX, struct.pack("<IHQ", 4_000_000, 1, 0)) * 100_000)
     ),

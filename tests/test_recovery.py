@@ -321,7 +321,7 @@ LONG = "- {history: 1, depth: 0x" + "f" * 5000 + ", reliability: 1, durability: 
 
 @pytest.mark.parametrize("profile", [MERGED, LONG], ids=["merge keys", "long number"])
 def test_profiles_that_yaml_cannot_read_in_time_are_left_out(tmp_path, profile):
-    """Merge keys of YAML take ten times as long with each line; Python does not print numbers of thousands of digits."""
+    """Merge keys take ten times as long with each line; Python does not print numbers of thousands of digits."""
     (tmp_path / "bag").mkdir()
     content = b"".join([HEADER, SCHEMA, channel(1, "/t", profile), message(bytes(4)), FOOTER])
     (tmp_path / "bag/bag.mcap").write_bytes(content)

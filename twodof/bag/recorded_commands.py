@@ -92,7 +92,7 @@ def read_commands(
     types = (*follows.types, *[JOINT_TRAJECTORY] * all(map(fmu.vector, (*FOLLOWING, "q_start"))))
     topics, begins, size = _messages(path, types, topic)
     chosen = _only(topics, path, topic, types)
-    most = _most(path, topics[chosen][0][1])
+    most = _most(path, topics[chosen])
     if len(topics[chosen]) > most or size > MAX_COMMANDS_SIZE:
         limit = f"{most} messages or {MAX_COMMANDS_SIZE // MIB} MiB of them"
         raise InputError(f"'{path}' has more than {limit} on {shown(chosen)}; cut it into several bags")
@@ -162,11 +162,11 @@ def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict
     return topics, begins, size
 
 
-def _most(path: Path, kind: str) -> int:
-    """Return the largest number of commands of a type that are read from a bag, by the size of its files."""
+def _most(path: Path, commands: Stored) -> int:
+    """Return the largest number of such commands that are read from a bag, by the size of its files."""
     packed = sum(file.stat().st_size for file in whole_bag(path))
     most = min(MAX_COMMANDS, MAX_FREE_COMMANDS + packed // MIN_COMMAND_PACKED)
-    return most // TRAJECTORY if kind == JOINT_TRAJECTORY else most
+    return most // TRAJECTORY if commands and commands[0][1] == JOINT_TRAJECTORY else most
 
 
 def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
