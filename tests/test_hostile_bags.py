@@ -230,9 +230,9 @@ def framed(frame: str) -> bytes:
 
 
 def interrupted(first: bytes, second: bytes, times: int) -> bytes:
-    """An MCAP file of pairs of records in one chunk, and of 1 MB that permits it to unpack to a gigabyte."""
+    """An MCAP file of pairs of records in one chunk, and of 3 MB that permits it to unpack to three gigabytes."""
     size = times * len(first + second)
-    ballast = record(0x90, np.random.default_rng(1).bytes(MIB))
+    ballast = record(0x90, np.random.default_rng(1).bytes(3 * MIB))
     return mcap_of(ballast, SCHEMA, CHANNEL, chunk(zipped(first + second, times), size, "zstd"))
 
 
