@@ -131,7 +131,7 @@ def rows_of(
 def resting_rows(
     parameters: Parameters, values: Dynamics, stretches: Sequence[Stretch], delay: float
 ) -> Iterator[tuple[Rows, float, float]]:
-    """Yield, for each stretch in which a joint may rest, its row, the variance of its effort, and its time, s.
+    """Yield, for each stretch in which a joint may rest, its row, the variance of its effort, and its middle, s.
 
     The row is a mean, scaled so that it has the noise of one sample. It is of means of samples, with weights that fade
     to 0 at both ends, because the noise of positions is large in accelerations that are sampled or cut off.
@@ -149,7 +149,7 @@ def resting_rows(
                     weights *= np.sqrt(many / np.sum(weights**2))
                     rows_in = projector(parameters, values, part, delay, True)
                     row = rows_in(i, slice(None), weights[None], np.zeros(1, np.int64))
-                    yield row, float(np.var(whole.tau[:, i])), part.t[0]
+                    yield row, float(np.var(whole.tau[:, i])), part.t[len(part.t) // 2]
 
 
 def projector(
