@@ -265,6 +265,25 @@ def test_joint_states_have_as_many_numbers_as_joints(bag, names, sizes, said, tm
         assert read_bag(bag).joints == (tuple(names) or ("joint 1", "joint 2"))
 
 
+def test_topics_that_appear_between_messages_end_no_batch(tmp_path):
+    """Recorders write a topic before its first message; a batch for each message would take 0.1 ms."""
+    state = serialised(joint_message(0, ["a"], [0.0]))
+    content = SCHEMA + CHANNEL + b"".join(channel(i, f"/t{i}") + message(state) for i in range(2, 200))
+    (tmp_path / "bag.mcap").write_bytes(HEADER + chunk(content, len(content), "") + FOOTER)
+    batches = [*read_messages(tmp_path / "bag.mcap", ReadBudget())]
+    assert [(batch.channel.topic, len(batch.stamps)) for batch in batches] == [("/joint_states", 198)]
+
+
+def test_messages_before_a_damaged_topic_are_read(tmp_path):
+    state = serialised(joint_message(0, ["a"], [0.0]))
+    content = SCHEMA + CHANNEL + message(state) * 3 + channel(1, "/other") + message(state)
+    (tmp_path / "bag.mcap").write_bytes(HEADER + chunk(content, len(content), "") + FOOTER)
+    numbers = []
+    with pytest.raises(DamageError, match="two topics of the number 1"):
+        numbers.extend(len(batch.stamps) for batch in read_messages(tmp_path / "bag.mcap", ReadBudget()))
+    assert numbers == [3]
+
+
 def test_joint_states_that_are_decoded_one_by_one_are_limited(bag, monkeypatch):
     """Frames of one length differ; each message takes 20 µs, and with many names milliseconds."""
     monkeypatch.setattr(joint_states, "MAX_ODD", 2000)

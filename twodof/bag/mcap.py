@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..bounds import MAX_CHUNK, MAX_LOOSE, MAX_PROVENANCE, MAX_RATIO
 from ..ros.cdr import Rows
-from .records import BATCH, RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, add_channel, refusing_damage
+from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, add_channel, refusing_damage
 
 if sys.version_info >= (3, 14):
     from compression import zstd as zstd
@@ -73,10 +73,11 @@ def read_metadata(path: Path, name: str, key: str) -> str:
 
 
 def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) -> Iterator[Batch]:
-    """Return the messages of a chunk in batches of one channel and length; a batch takes 20 µs.
+    """Return the messages of a chunk in batches of one channel and length; a batch takes 0.1 ms.
 
-    If records repeat periodically, as in most bags of ROS 2, all of them are read at once. One by one, each would take
-    a microsecond.
+    Later records of topics change no earlier topic, so that messages before and after them are one batch. If records
+    repeat periodically, as in most bags of ROS 2, all of them are read at once. One by one, each would take a
+    microsecond.
     """
     position = skips = 0
     seen: dict[bytes, int] = {}  # different headers of the latest message records, and their offsets
@@ -97,10 +98,13 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
         budget.spend(RECORD)
         head = chunk[position : position + HEAD.size + 2]
         if opcode in (SCHEMA, CHANNEL):
-            budget.spend(TEXT * length + BATCH * len(waiting))
-            yield from gathered()
             seen = {}
-            tables.add(path, opcode, chunk, position + HEAD.size)
+            try:
+                budget.spend(TEXT * length)
+                tables.add(path, opcode, chunk, position + HEAD.size)
+            except Exception:  # earlier messages are sound
+                yield from gathered()
+                raise
         elif opcode == MESSAGE and head in seen and not skips:
             turn = [offset for offset in seen.values() if offset >= seen[head]]
             rows = _turns(every[turn[0] :], [offset - turn[0] for offset in turn], position - turn[0])[1:]

@@ -19,7 +19,6 @@ from ..bounds import MAX_CHUNK, MAX_NAME, MAX_RATIO, MAX_TOPICS
 from ..ros.cdr import Rows
 
 RECORD = 2000  # bytes of budget for a record; a packed message takes at least 3 bytes of a file
-BATCH = 200_000  # of a batch of messages that the next record of a topic ends; 0.1 ms
 TEXT = 100  # bytes of budget for each byte of a topic's texts, which stay in memory
 
 Stamps = NDArray[np.int64]

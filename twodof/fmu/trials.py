@@ -179,7 +179,7 @@ def _restored(trial: Trial, instance: Instance, saved: c_void_p, rows: Sequence[
     restore(rows[-1], "state that was saved into an existing one", "")
     trial.note("freeing the state")
     instance.slave.freeFMUState(saved)
-    if saved:  # FMUs of pythonfmu 0.7, which run well in most tools
+    if saved:  # so pythonfmu does, in Python FMUs of this project too: importers do not use a freed state
         raise UnpassedError("remark", "the pointer to a state is not null after the state was freed, as FMI demands")
     return f"save, {half} steps, restore, {half} steps: equal"
 
