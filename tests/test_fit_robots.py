@@ -75,7 +75,7 @@ def test_all_masses_of_a_ur5_that_can_be_seen_are_found(tmp_path):
     result = twodof.fit(UR5, bag, ("mass:*", "com:*", "inertia:*", "friction[*]"), output=tmp_path / "fitted")
     assert result.explains and result.unseen
     summary = next(line for line in result.remarks if "do not determine" in line)
-    assert f"and {len(result.unseen) - 5} more combinations" in summary and len(summary) < 600
+    assert f"fit.json lists {len(result.unseen) - 5} more combinations" in summary and len(summary) < 600
     assert not any(p.known for p in result.parameters if p.name.startswith("mass:shoulder_link"))
     for p in result.parameters:
         if p.name.startswith("friction"):

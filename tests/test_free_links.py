@@ -373,4 +373,4 @@ def test_a_mass_that_the_controller_does_not_know_is_the_cause_of_a_failure(tmp_
         ({"com_link2": 0.1}, "com"),
     ):
         first = twodof.simulate(fmu, settings=settings).verdict.causes[0]
-        assert words in first.text and first.tried.startswith("with that of the model: 0.000224 m")
+        assert words in first.text and first.tried.startswith("with that of the model: error 0.000224 m")
