@@ -25,7 +25,9 @@ import pytest
 import trimesh
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from tools import needs
 
 import twodof
 from twodof.export.stock_robots import stock_robots
@@ -530,10 +532,14 @@ def test_meshes_are_read_from_an_fmu_that_stores_folders(native_path, tmp_path):
     assert len(plain) >= 2 and other == plain
 
 
-def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path):
+@pytest.fixture(scope="module")
+def panda(tmp_path_factory):
+    return twodof.build_fmu(tmp_path_factory.mktemp("panda") / "panda.fmu", twodof.stock_robot("panda"))
+
+
+def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(panda, tmp_path):
     """Pinocchio reads URDF and meshes by the bag's description and the files that it names."""
-    fmu = twodof.build_fmu(tmp_path / "panda.fmu", twodof.stock_robot("panda"))
-    twodof.simulate(fmu, twodof.Bag(tmp_path / "Müller", meshes=True), stop_time=0.02)
+    twodof.simulate(panda, twodof.Bag(tmp_path / "Müller", meshes=True), stop_time=0.02)
     description = description_in(tmp_path / "Müller")
     source = stock_robots()["panda"]
     truth = pin.buildGeomFromUrdf(
@@ -548,3 +554,35 @@ def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path):
         corners = [geometry.geometry.vertices() for geometry in (shown, wanted)]
         assert corners[0].size >= 954
         np.testing.assert_allclose(corners[0], corners[1], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.needs("urdf-loader")
+def test_a_scene_with_meshes_shows_a_panda_in_three_js_where_pinocchio_has_it(panda, tmp_path):
+    """Pinocchio reads the original URDF and its meshes; three.js has vertices in single precision.
+
+    It also has four vertices that Pinocchio leaves out, within the bounding boxes of the links.
+    """
+    bag = tmp_path / "a b#1%20ü?"
+    twodof.simulate(panda, twodof.Bag(bag, meshes=True), stop_time=0.5, settings={"x_des": (0.45, 0.25, 0.6)})
+    command = [needs("node"), str(Path(__file__).with_name("scene_reader.mjs")), str(bag / f"{bag.name}.mcap")]
+    found = json.loads(subprocess.check_output(command, stderr=subprocess.PIPE).splitlines()[-1])
+    assert np.ptp([twodof.read_bag(bag).q[0], twodof.read_bag(bag).q[-1]], axis=0).max() > 0.1
+    source = str(stock_robots()["panda"])
+    model = pin.buildModelFromUrdf(source)
+    visuals = pin.buildGeomFromUrdf(
+        model, source, pin.GeometryType.VISUAL, package_dirs=str(stock_robots()["panda"].parents[4])
+    )
+    q = np.array([found["q"][name.replace("finger_joint2", "finger_joint1")] for name in list(model.names)[1:]])
+    poses = visuals.createData()
+    pin.updateGeometryPlacements(model, model.createData(), visuals, poses, q)
+    links = 0
+    for shape, pose in zip(visuals.geometryObjects, poses.oMg):
+        link = model.frames[shape.parentFrame].name
+        expected = shape.geometry.vertices() @ pose.rotation.T + pose.translation
+        for way in ("joints", "tf"):
+            vertices = np.array(found[way][link])
+            assert KDTree(vertices).query(expected)[0].max() < 1e-6, (way, link)
+            box = [[points.min(axis=0), points.max(axis=0)] for points in (vertices, expected)]
+            np.testing.assert_allclose(box[0], box[1], rtol=0.0, atol=1e-6, err_msg=f"{way} {link}")
+        links += 1
+    assert links == 11

@@ -92,6 +92,7 @@ TOOLS = {
     "strace": Tool("the order of writes to a disk", "strace"),
     "tbb": Tool("FMUs in ecos", "libtbb12", here=loads("libtbb.so.12")),
     "tsc": Tool("types in the pages' scripts", "node-typescript"),
+    "urdf-loader": Tool("scenes in three.js", names=(str(NODE / "urdf-loader"),), remedy=INSTALL),
     "valgrind": Tool("memory errors", "valgrind"),
     "wine": Tool("libraries for Windows", "wine64", ("wine64", "wine", "/usr/lib/wine/wine64")),
     "wineserver": Tool("libraries for Windows", "wine64"),
