@@ -278,7 +278,7 @@ def test_messages_before_a_damaged_topic_are_read(tmp_path):
     state = serialised(joint_message(0, ["a"], [0.0]))
     content = SCHEMA + CHANNEL + message(state) * 3 + channel(1, "/other") + message(state)
     (tmp_path / "bag.mcap").write_bytes(HEADER + chunk(content, len(content), "") + FOOTER)
-    numbers = []
+    numbers: list[int] = []
     with pytest.raises(DamageError, match="two topics of the number 1"):
         numbers.extend(len(batch.stamps) for batch in read_messages(tmp_path / "bag.mcap", ReadBudget()))
     assert numbers == [3]
