@@ -699,6 +699,8 @@ def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:
 
 def test_a_value_that_an_fmu_refuses_is_reported_and_changes_nothing(page) -> None:
     assert "rtol = 0 must be > 0" in refused(page, "arm.set('rtol', 0)")
+    for seed, message in ((2**31, "must be in [0, 2147483647]"), (0.5, "seed = 0.5 must be a whole number")):
+        assert message in refused(page, "arm.set('seed', a)", seed)
     assert page.evaluate("arm.held('rtol')") == [1e-3]
     for name, value, message in (
         ("nothing", 1, "there is no variable 'nothing'"),

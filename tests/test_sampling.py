@@ -451,7 +451,7 @@ REFUSED: dict = {
     ("effort", "rho"): ({"q_resolution": -0.1}, "q_resolution[1] = -0.1 must be >= 0"),
     ("effort", "sigma"): ({"q_noise": -0.1}, "q_noise[1] = -0.1 must be >= 0"),
     ("effort", "seed"): ({"seed": -1}, "seed = -1 must be in [0, 2147483647]"),
-    ("effort", "large"): ({"seed": 2**31}, "seed = 2147483648 must be a whole number of 32 bits"),
+    ("effort", "large"): ({"seed": 2**31}, "seed = 2147483648 must be in [0, 2147483647]"),
     ("effort", "half"): ({"seed": 0.5}, "seed = 0.5 must be a whole number"),
     ("effort", "short"): ({"control_period": 1e-9}, "control_period = 1e-09 s divides a step of 0.01 s into more than"),
 }

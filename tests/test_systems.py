@@ -808,7 +808,7 @@ def refusals() -> Iterator[tuple[str, bytes | None, dict[str, bytes], str]]:
         parts = wired.replace(component("pd"), component("pd", inner))
         yield f"{name} twice", ssd(parts), {}, r"of 'pd' sets 'Kp' twice"
     parts = wired.replace(component("pd"), component("pd", binding(values("seen Real 4294967299"))))
-    yield "32 bits", ssd(parts), {}, "a whole number of 32 bits"
+    yield "32 bits", ssd(parts), {}, "seen = 4294967299 must be in .-2147483648, 2147483647."
     both = connection("k", "pd.q_des[1]") + connection("k", "pd.seen")
     own = connectors({"k": "input"}) + more.format(both)
     yield "two types", ssd(own), {}, "the connector 'k' goes to variables of type Integer and Real"

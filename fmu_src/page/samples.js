@@ -62,12 +62,10 @@ export class Samples {
     const values = Array.isArray(value) ? value : names.map(() => value);
     if (values.length !== names.length) throw new Error(`${name} has ${names.length} elements`);
     const pairs = names.map((element, i) => {
-      const { causality, start, type } = this.variable(element);
+      const { causality, start } = this.variable(element);
       if (!this.values.has(element)) throw new Error(`${element}, ${causality}, cannot be set`);
       if (typeof values[i] !== typeof start || !Number.isFinite(Number(values[i])))
         throw new Error(`${element} = ${values[i]} is not a ${typeof start}`);
-      if (type === "Integer" && values[i] !== (Number(values[i]) | 0))
-        throw new Error(`${element} = ${values[i]} is not a whole number of 32 bits`);
       return /** @type {[string, Value]} */ ([element, values[i]]);
     });
     const all = new Map([...this.values, ...pairs]);

@@ -56,18 +56,18 @@ class Type(NamedTuple):
             number = inf if given > 0 else -inf
         if not isfinite(number):
             raise InputError(f"{name} = {number} is not finite")
-        whole, low, high = WHOLE.get(self.name), self.low, self.high
+        whole, low, high = WHOLE.get(self.name), f"{self.low:.12g}", f"{self.high:.12g}"
         text = f"{given}" if isinstance(given, int) else f"{given:.17g}"
+        within = self.low <= number <= self.high
         if whole is not None:
-            if not number.is_integer() or int(given) not in whole:
-                bits = (whole[-1] - whole[0]).bit_length()
-                sign = " that is not negative" if whole[0] == 0 else ""
-                raise InputError(f"{name} = {text} must be a whole number of {bits} bits{sign}")
-            number, low, high = int(given), max(low, whole[0]), min(high, whole[-1])
+            if not number.is_integer():
+                raise InputError(f"{name} = {text} must be a whole number")
+            number, least, most = int(given), max(self.low, whole[0]), min(self.high, whole[-1])
+            low, high, within = f"{least}", f"{most}", least <= number <= most
         elif abs(number) > LARGEST[self.name]:
             raise InputError(f"{name} = {text} is too large for its type {self.name}")
-        if not low <= number <= high:
-            raise InputError(f"{name} = {text} must be in [{low:.12g}, {high:.12g}]")
+        if not within:
+            raise InputError(f"{name} = {text} must be in [{low}, {high}]")
         return number
 
     def _item(self, given: object, name: str) -> int:
