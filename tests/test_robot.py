@@ -456,3 +456,22 @@ def test_example_robot_is_the_one_that_pinocchio_loads(robots: Path, name: str, 
     loaded = load_robot(urdf, str(moved.get("link")), "xyz")
     assert n in (None, len(loaded.joints))
     assert_same_mechanism(loaded, urdf)
+
+
+@pytest.mark.parametrize("axes", ["xyz", "xy", "xz", "z"])
+def test_no_singular_value_changes_faster_than_its_bound(ur5: str, axes: str) -> None:
+    robot = load_robot(ur5, "ee_link", axes)
+    data, rng = robot.model.createData(), np.random.default_rng(0)
+    rows = {"position": ["xyz".index(axis) for axis in axes]}
+    rows["pose"] = [*rows["position"], 3, 4, 5]
+
+    def ratios(q: np.ndarray, of: str) -> np.ndarray:
+        J = pin.computeFrameJacobian(robot.model, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED)[rows[of]]
+        sigma = np.linalg.svd(J, compute_uv=False)
+        return sigma / sigma[0]
+
+    for q in rng.uniform(-3.0, 3.0, (100, 6)):
+        for i, bound in enumerate(robot.swing()):
+            step = 1e-6 * np.eye(6)[i]
+            for of in rows:
+                assert np.abs(ratios(q + step, of) - ratios(q - step, of)).max() / 2e-6 <= bound + 1e-8

@@ -177,6 +177,21 @@ static double sweep(const Step *step, int near[N_STATES])
     return change;
 }
 
+/* Bound on the rate of change of the singular values within the step, per s. */
+static double swing_rate(const Step *step)
+{
+    double rate = 0.0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        double low = step->K[0][i], high = low;
+        for (int stage = 1; stage <= step->stages; stage++) {
+            low = fmin(low, step->K[stage][i]);
+            high = fmax(high, step->K[stage][i]);
+        }
+        rate += SWING[i] * 0.5 * (fabs(low + high) + PACE * (high - low));
+    }
+    return rate;
+}
+
 /* Determine the event at a time within the step, with state y. */
 static void name_event(Step *step, double passed, const double y[N_STATES], Event *event)
 {
@@ -225,8 +240,7 @@ static double first_event(Step *step, int rank_held, Event *event)
     }
     first = fmin(first, first_release(step, first));
     if (near_rank)
-        first = fmin(first, search(step, singular_margin, rank_held,
-                                   PACE / REACH * change / step->size, 0.0,
+        first = fmin(first, search(step, singular_margin, rank_held, swing_rate(step), 0.0,
                                    singular_margin(step, 0.0, rank_held), step->size,
                                    singular_margin(step, step->size, rank_held), HALVINGS));
     if (first == HUGE_VAL)

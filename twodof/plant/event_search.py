@@ -94,6 +94,15 @@ def expected_event(
     return first if first <= most else inf
 
 
+def fastest(K: Sequence[State], n: int) -> list[float]:
+    """Return bounds on the first n magnitudes of the interpolant's rate, given the derivatives K at the stages.
+
+    The weights of the rate sum to 1, so that it is at most PACE times half the range of K from the middle of the range.
+    """
+    ranges = [(min(speeds), max(speeds)) for speeds in zip(*(k[:n] for k in K))]
+    return [0.5 * (abs(low + high) + PACE * (high - low)) for low, high in ranges]
+
+
 def search(
     margin: Margin, rate: float, a: float, at_a: float, b: float, at_b: float, step: float, halvings: int = HALVINGS
 ) -> float:

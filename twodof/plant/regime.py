@@ -34,7 +34,7 @@ to the first one.
 """
 AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
 """Values of the parameter ``integrator``."""
-BUDGET = 2_000_000
+BUDGET = 10_000_000
 """Most evaluations of the right-hand side in one communication step; only a stiff motion would need more."""
 MOST_ROWS = 6
 """Largest number of rows of a task Jacobian: three axes, and three for an orientation."""
@@ -269,7 +269,7 @@ class Motion:
             first = min(first, events.first_release(grips, self.grips, weights, doubtful, step, first, resolution))
         if near_rank:
             a, b = singular_margin(0.0), singular_margin(step)
-            pace = events.PACE / events.REACH * sweep / step
+            pace = sum(map(float.__mul__, self._equations.swing, events.fastest(K, n)))
             first = min(first, events.search(singular_margin, pace, 0.0, a, step, b, step))
         if first == inf:
             return None

@@ -73,17 +73,26 @@ class Robot:
         A joint i of a chain changes column j of the Jacobian by the cross product of an axis with
         column max(i, j), so that ‖∂J/∂q_i‖ ≤ √n σ_max for n joints. By Weyl's inequality no singular value changes
         faster, and no ratio σ/σ_max changes by more than 2 √n per unit. With fewer than three task axes, the columns
-        are projections, and the bound is an estimate.
+        are projections, and the bound is an estimate. A first joint that moves the task as a rigid body, within its
+        axes, changes no singular value.
         """
         path = self._path()
         bound = 2.0 * math.sqrt(len(path)) * np.abs(path).sum(axis=0)
+        first = np.flatnonzero(path[:1].any(axis=0))
+        if len(first) == 1 and not path[1:, first].any():
+            J = pin.computeJointJacobians(self.model, self.model.createData(), pin.neutral(self.model))
+            rotation, task = pin.skew(J[3:, self._support()[0] - 1]), np.diag([float(a in self.axes) for a in "xyz"])
+            bound[first] *= not np.allclose(task @ rotation, rotation @ task, atol=1e-12)
         return tuple(bound.tolist())
 
     def _path(self) -> NDArray[np.float64]:
         """Return the coupling's rows for the joints between the root and the task frame."""
-        support = list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
         coupling = np.eye(len(self.joints)) if self.coupling is None else self.coupling
-        return coupling[[i - 1 for i in support]]
+        return coupling[[i - 1 for i in self._support()]]
+
+    def _support(self) -> list[int]:
+        """Return Pinocchio's indices of the joints between the root and the task frame."""
+        return list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
 
 
 def load_robot(text: str, frame: str, axes: str) -> Robot:
