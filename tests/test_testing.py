@@ -114,6 +114,10 @@ def test_incomparable_bags_fail(runs):
         assert_within_limits(unknown)
     with pytest.raises(AssertionError, match="the run cannot settle"):
         assert_settles(unknown, within=9.0)
+    forged = dataclasses.replace(good, provenance={**good.provenance, "start_values": {}}, received=None)
+    for within in (9.0, 1e-3):
+        with pytest.raises(AssertionError, match="the run cannot settle: the bag has no target"):
+            assert_settles(forged, within=within)
     with pytest.raises(AssertionError, match=r"400 samples in 3\.99 s, and its reference 401 samples in 4 s"):
         assert_equal(shorter, good, within=1.0)
     with pytest.raises(AssertionError, match="the joints are a, b, those of the reference joint1, joint2"):
