@@ -44,9 +44,11 @@ def __getattr__(name: str) -> object:
     import importlib
 
     from .errors import TwoDofError
+    from .signatures import refusing_unknown
 
     try:
-        return getattr(importlib.import_module(_HOMES[name], __name__), name)
+        public = getattr(importlib.import_module(_HOMES[name], __name__), name)
+        return globals().setdefault(name, refusing_unknown(public, name))
     except TwoDofError as error:  # without its extra, a name can be imported, and its use raises this
         missing = error
 

@@ -63,7 +63,7 @@ def simulate(
     return simulate_together([member], pace=pace, stop=stop)[0]
 
 
-run = with_keywords_of(name="run")(simulate)  # the name of the command
+run = simulate  # the name of the command
 
 
 class Member(NamedTuple):
