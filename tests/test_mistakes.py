@@ -75,6 +75,7 @@ MISTAKES: dict[str, str] = {
     "run gains": "'gains' is not an FMU: it is a sweep; use 'twodof plot gains'",
     "run folder": "'folder' is not an FMU: it is a folder without a bag",
     "run arn.fmu": "no FMU 'arn.fmu'; did you mean 'arm.fmu'",
+    "run arm-native.fmu": "no FMU 'arm-native.fmu'; did you mean 'arm.fmu'",
     "run x.fmu": "no FMU 'x.fmu'; make one with 'twodof build'",
     "run missing/arm.fmu": "no FMU 'missing/arm.fmu': there is no folder 'missing'",
     "run notes.txt": "'notes.txt' is not an FMU",

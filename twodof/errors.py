@@ -180,8 +180,8 @@ def neighbour(path: Path, *kinds: str) -> Path | None:
     """Return the path of one of these kinds with the nearest name in the same folder, or None."""
     others = (path.parent / name for name in _names(path.parent))
     stems = {other.stem: other for other in others if kind_of(other) in kinds}
-    near = nearest(path.stem, stems)
-    return stems[near] if near else None
+    alike = (stem for stem in stems if stem.startswith(path.stem) or path.stem.startswith(stem))
+    return stems.get(nearest(path.stem, stems) or next(alike, ""))
 
 
 def _names(folder: Path) -> list[str]:
