@@ -19,7 +19,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.patches import Arc
+from matplotlib.lines import Line2D
+from matplotlib.patches import Arc, Patch
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -39,6 +40,7 @@ INK, GREY, BLUE, ORANGE = "#1f2933", "#8a94a0", "#0060a8", "#f58c24"
 WINDOW = (-0.110, 0.470, -0.148, 0.236)  # m: left, right, bottom, top
 WIDTH = 1200  # pixels
 GAINS = (20, 50, 400)  # 1/s²
+RED, HATCHES = "#d62728", "///"
 OVERSAMPLING = 3
 LIGHT = np.array([-0.45, 0.60, 0.66])
 STEP_IN_DEPTH = 0.0012  # m: an edge is drawn where the depth jumps by more
@@ -252,7 +254,7 @@ def draw_sampled(folder: Path, path: Path) -> None:
     """Draw where the joints of a sampled arm with friction end, over gains and at two rates."""
     fmu = twodof.build_fmu(folder / "Joint.fmu", twodof.FmuOptions(control="joint", native=True))
     grid = {"Kp": np.geomspace(10, 30000, 36), "Kd": np.geomspace(5, 500, 24)}
-    figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.4), sharey=True, layout="constrained")
+    figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.7), sharey=True, layout="constrained")
     for axes, T in zip(all_axes, (0.001, 0.01)):
         settings = {**AS_IT_IS, "control_period": T}
         table = folder / f"sampled {T}"
@@ -261,12 +263,15 @@ def draw_sampled(folder: Path, path: Path) -> None:
         Kp, Kd = (np.unique(rows[name]) for name in grid)
         error, chatter = (rows[m].to_numpy().reshape(len(Kp), len(Kd)) for m in ("final_joint_error", "chatter"))
         drawn_errors = axes.pcolormesh(Kd, Kp, error, norm=LogNorm(1e-3, 1.0), cmap="viridis", shading="nearest")
-        axes.contourf(Kd, Kp, chatter, levels=[1.0, np.inf], colors="none", hatches=["///"])
+        axes.contourf(Kd, Kp, chatter, levels=[1.0, np.inf], colors="none", hatches=[HATCHES])
         radius = [[spectral_radius(p, d, T, AS_IT_IS["control_delay"], differences=True) for d in Kd] for p in Kp]
-        axes.contour(Kd, Kp, radius, levels=[1.0], colors="#d62728", linewidths=2)
+        axes.contour(Kd, Kp, radius, levels=[1.0], colors=RED, linewidths=2)
         axes.set(xscale="log", yscale="log", xlabel="Kd, 1/s", title=f"{1.0 / T:g} Hz")
     all_axes[0].set_ylabel("Kp, 1/s²")
     figure.colorbar(drawn_errors, ax=all_axes, label="largest joint error after 3 s, rad")
+    hatched = Patch(facecolor="none", edgecolor="black", hatch=HATCHES, label="chatter above 1 N·m")
+    limit = Line2D([], [], color=RED, lw=2, label="stability limit without friction")
+    figure.legend(handles=[hatched, limit], loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
     plt.close(figure)
 
