@@ -46,6 +46,8 @@ class Mechanism:
         self._model, self._data = model, model.createData()
         self._G, self._c = robot.coupling, robot.offset
         self._still = np.zeros(model.nv)
+        self._upper = np.tri(model.nv, dtype=bool).T
+        self._inverse_at: tuple[bytes, Array] = b"", self._still
         # both are views that Pinocchio updates
         self._placement: pin.SE3 = self._data.oMf[self._frame]
         self._position: Array = self._placement.translation
@@ -98,13 +100,21 @@ class Mechanism:
     def mass_matrix(self, q: Array) -> Array:
         """Return M(q), n × n."""
         G = self._G
-        M = pin.crba(self._model, self._data, q if G is None else G @ q + self._c)
-        M = np.triu(M) + np.triu(M, 1).T
+        M = self._symmetric(pin.crba(self._model, self._data, q if G is None else G @ q + self._c))
         return M if G is None else np.asarray(G.T @ M @ G)
 
     def inverse_mass(self, q: Sequence[float] | Array) -> Array:
-        """Return M(q)⁻¹, n × n."""
-        if self._G is not None:
-            return np.asarray(np.linalg.inv(self.mass_matrix(np.array(q))))
-        inverse = pin.computeMinverse(self._model, self._data, np.array(q))
-        return np.asarray(np.triu(inverse) + np.triu(inverse, 1).T)
+        """Return M(q)⁻¹, n × n; callers do not change it."""
+        q = np.array(q)
+        key = q.tobytes()
+        if key != self._inverse_at[0]:  # friction and stops ask for it at the same positions
+            if self._G is not None:
+                inverse: Array = np.asarray(np.linalg.inv(self.mass_matrix(q)))
+            else:
+                inverse = self._symmetric(pin.computeMinverse(self._model, self._data, q))
+            self._inverse_at = key, inverse
+        return self._inverse_at[1]
+
+    def _symmetric(self, M: Array) -> Array:
+        """Return a matrix of which Pinocchio has computed the upper triangle."""
+        return np.where(self._upper, M, M.T)

@@ -81,7 +81,8 @@ class Robot:
         first = np.flatnonzero(path[:1].any(axis=0))
         if len(first) == 1 and not path[1:, first].any():
             J = pin.computeJointJacobians(self.model, self.model.createData(), pin.neutral(self.model))
-            rotation, task = pin.skew(J[3:, self._support()[0] - 1]), np.diag([float(a in self.axes) for a in "xyz"])
+            axis = J.reshape(6, -1)[3:, self._support()[0] - 1]  # with one joint, Pinocchio returns a vector
+            rotation, task = pin.skew(axis), np.diag([float(a in self.axes) for a in "xyz"])
             bound[first] *= not np.allclose(task @ rotation, rotation @ task, atol=1e-12)
         return tuple(bound.tolist())
 
