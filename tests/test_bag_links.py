@@ -86,6 +86,16 @@ def test_a_pipe_in_the_place_of_messages_is_refused(linked, capsys):
         assert line == f"twodof: error: '{file}' is not a regular file; remove it from the bag"
 
 
+def test_a_pipe_among_the_meshes_is_refused(linked, capsys):
+    (linked / "meshes").mkdir(exist_ok=True)
+    for name in ("one", "two"):
+        os.mkfifo(linked / "meshes" / name)
+    assert main(["recover", str(linked)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    start, end = f"twodof: error: cannot recover the bag '{linked}': ", " is a named pipe; nothing is lost"
+    assert line in [f"{start}`{linked}/meshes/{name}`{end}" for name in ("one", "two")]
+
+
 def test_a_bag_that_the_user_names_by_a_link_is_read(linked):
     twodof.recover(linked)
     (linked.parent / "name").symlink_to(linked)

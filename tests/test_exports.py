@@ -1,7 +1,9 @@
 """Exports of bags as tables and single files, by independent readers; compressed chunks."""
 
 import csv
+import io
 import json
+import shutil
 import tempfile
 import tracemalloc
 
@@ -9,7 +11,7 @@ import duckdb
 import numpy as np
 import pandas
 import pytest
-from bags import joint_message, write_third_party
+from bags import SECOND, joint_message, write_third_party
 from failures import fmu_of
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -18,6 +20,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError
+from twodof.files import data_file
 
 
 @pytest.fixture(scope="module")
@@ -187,3 +190,80 @@ def test_a_dataset_has_no_objects_for_each_sample(tmp_path):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 400 * samples  # a NumPy array in an object column takes a kilobyte
+
+
+FORMULAS = (
+    "=cmd|' /C calc'!A0",
+    "+1+1",
+    "-1+1",
+    "@SUM(1+1)",
+    "\t=1+1",
+    "a;=1+1",
+    "b\n=1+1",
+    'c,"=1+1',
+    "＝1+1",
+    "up-left",
+)
+
+
+def test_a_joint_is_no_formula_in_a_spreadsheet(tmp_path):
+    """A spreadsheet divides a line at commas, or at semicolons or tabs, by its language."""
+    states = (("/joint_states", k * SECOND, joint_message(k, FORMULAS, [0.0] * len(FORMULAS))) for k in range(1, 4))
+    bag = write_third_party(tmp_path / "bag", states)
+    text = twodof.export_bag(bag, tmp_path / "out.csv").read_text("utf-8")
+    for separator in ",;\t":
+        for quoting in (csv.QUOTE_MINIMAL, csv.QUOTE_NONE):
+            cells = [
+                cell for row in csv.reader(io.StringIO(text), delimiter=separator, quoting=quoting) for cell in row
+            ]
+            assert not [cell for cell in cells if cell.strip(' "\t').startswith((*"=+-@＝",))]
+    assert text.count("1+1") == 8
+    assert pandas.read_csv(tmp_path / "out.csv").columns[-1] == "up-left.position"
+
+
+def test_an_export_by_a_robots_address_does_not_replace_a_file_of_its_bag(bag_path, tmp_path):
+    pair = shutil.copytree(bag_path, tmp_path / "pair")
+    shutil.copy(pair / "run.json", pair / "run.left.json")
+    (pair / "run.json").rename(pair / "run.right.json")
+    before = {file: file.read_bytes() for file in pair.iterdir()}
+    with pytest.raises(twodof.TwoDofError, match=r"is in the bag, whose files are not replaced"):
+        twodof.export_bag(f"{pair}:left", pair / "bag.mcap")
+    assert before == {file: file.read_bytes() for file in pair.iterdir()}
+    assert twodof.export_bag(f"{pair}:left", tmp_path / "out.mcap").stat().st_size
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "build arm.urdf -o link.urdf --overwrite",
+        "page arm.html -o ./arm.html",
+        "run arm.fmu --input bag -o bag --overwrite",
+        "run arm.fmu --input bag:/topic -o bag --overwrite",
+        "run bag/arm.fmu -o bag --overwrite",
+        "run arm.fmu --input bag/table.csv -o bag --overwrite",
+        "plot bag --urdf arm.png -o arm.png",
+        "view bag --fmu arm.html --export arm.html",
+        "publish left=bag/arm.fmu -o bag --overwrite",
+        "export bag/bag.mcap -o bag/bag.mcap",
+    ],
+)
+def test_an_output_replaces_no_input(command, bag_path, native_path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(bag_path, "bag")
+    shutil.copy(data_file("urdf", "2dof.urdf"), "arm.urdf")
+    for name in ("arm.fmu", "arm.html", "arm.png", "bag/arm.fmu", "bag/table.csv"):
+        shutil.copy(native_path, name)
+    (tmp_path / "link.urdf").symlink_to("arm.urdf")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    assert main(command.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "would replace the input '" in line
+    assert before == {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+
+
+def test_a_run_may_replace_a_bag_that_is_none_of_its_inputs(native_path, tmp_path, monkeypatch):
+    """A robot may have the name of the bag."""
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        assert main(["run", str(native_path), "-o", "bag", "--overwrite", "--stop-time", "0.02"]) == 0
+    assert main(["run", "none.ssp", "--robot", "bag", "-o", "bag", "--overwrite"]) == 1

@@ -11,6 +11,7 @@ import pytest
 import twodof
 from twodof.cli.main import main
 from twodof.export.stock_robots import stock_robots
+from twodof.files import data_file
 
 
 @pytest.mark.parametrize(
@@ -130,3 +131,15 @@ def test_a_home_pose_outside_of_the_limits_is_the_same_pose_within_them():
         pin.forwardKinematics(model, data, each)
         placements.append(np.array(data.oMi[model.njoints - 1]))
     np.testing.assert_allclose(placements[0], placements[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["<!DOCTYPE robot><robot/>", f"<robot>{'<a>' * 600}{'</a>' * 600}</robot>", "<srdf/>"])
+def test_an_srdf_is_read_as_a_urdf_is(text, tmp_path, monkeypatch):
+    """Without entities, and with limits."""
+    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path))
+    for folder, suffix in (("robots", "urdf"), ("srdf", "srdf")):
+        (tmp_path / f"arm/{folder}").mkdir(parents=True)
+        (tmp_path / f"arm/{folder}/my_arm.{suffix}").write_text(text)
+    shutil.copy(data_file("urdf", "2dof.urdf"), tmp_path / "arm/robots/my_arm.urdf")
+    with pytest.raises(twodof.TwoDofError, match=r"my_arm.srdf': the SRDF"):
+        twodof.stock_robot("my_arm")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import count
@@ -24,6 +25,8 @@ from .recording import Array, Recording
 from .recovery import copy_messages
 
 PART = 100_000  # cells of a CSV file that are written at a time
+FORMULA = re.compile(r"(?:^|[;,|\"\t\r\n])\s*(?=[=+@＝＋－＠-])")
+"""Position before a character that begins a formula in a spreadsheet, whatever separates its cells."""
 ENDINGS = (".csv", ".parquet", ".mcap", ".lerobot")
 
 
@@ -33,8 +36,9 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     A table has one row for each sample. Its columns are "time"; for a joint "elbow", "elbow.position",
     "elbow.velocity" and "elbow.effort"; and for a task axis "y", "x.y" and "x_des.y". Unknown quantities have no
     column. Units are in the header of a CSV file, "elbow.position [rad]", and in the pandas attributes of a Parquet
-    file. Values are in SI units, in full precision. An MCAP file has all messages, with the provenance as metadata. A
-    folder with the suffix .lerobot is a LeRobot dataset (``lerobot.write_dataset``) with an episode for each bag.
+    file. In a CSV file an apostrophe precedes a name that a spreadsheet would read as a formula. Values are in SI
+    units, in full precision. An MCAP file has all messages, with the provenance as metadata. A folder with the suffix
+    .lerobot is a LeRobot dataset (``lerobot.write_dataset``) with an episode for each bag.
 
     Raises:
         BagError: the bag is incomplete, the suffix is unknown, pandas or pyarrow is missing, or the file cannot be
@@ -44,7 +48,7 @@ def export_bag(bag: str | Path | Sequence[str | Path], output: str | Path) -> Pa
     path = path_of(output, "export")
     if path.suffix not in ENDINGS:
         raise BagError(f"'{path}': the name of an export ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    if path.resolve().parent in [each.resolve() for each in bags]:
+    if {*path.resolve().parents} & {robot_in(each)[0].resolve() for each in bags}:
         raise BagError(f"'{path}' is in the bag, whose files are not replaced; give another `output`")
     if path.suffix == ".lerobot":
         write_dataset(bags, path)
@@ -79,7 +83,9 @@ def _columns(run: Recording) -> dict[str, tuple[str, Array]]:
 
 
 def _csv(columns: dict[str, tuple[str, Array]]) -> Iterator[bytes]:
-    rows: Iterable[Sequence[object]] = [[f"{name} [{unit}]" if unit else name for name, (unit, _) in columns.items()]]
+    rows: Iterable[Sequence[object]] = [
+        [FORMULA.sub(r"\g<0>'", f"{name} [{unit}]" if unit else name) for name, (unit, _) in columns.items()]
+    ]
     part = max(1, PART // len(columns))
     for k in count(0, part):
         file = io.StringIO()

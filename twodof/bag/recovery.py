@@ -96,6 +96,8 @@ def recover(path: str | Path) -> Recovered:
         raise BagError(f"'{bag}' has folders that are nested too deeply; move them out of the bag") from error
     except (OSError, sqlite3.Error, WriterError) as error:
         reason = getattr(error, "strerror", None) or str(error)
+        if isinstance(error, shutil.Error):  # of a folder: source, destination and reason of each file
+            _, _, reason = error.args[0][0]
         raise BagError(f"cannot recover the bag '{bag}': {reason}; nothing is lost") from error
     return Recovered(bag, original, counts, damage)
 

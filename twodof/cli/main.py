@@ -23,6 +23,7 @@ from .options import CommandLineError
 from .printing import CLEAR, in_options, say
 from .signals import INTERRUPTED, is_interrupt
 
+INPUTS = ("fmu", "urdf", "robot", "bag", "bags", "robots", "input")
 VERBS = (build, run, publish, layouts, check, info, linearise, fit, plot, view, live, page, sweep, export, recover)
 """The verbs in the order of the help, which has the first line of each docstring."""
 LONGEST_LINE = 2000
@@ -71,7 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.pop("SOURCE_DATE_EPOCH", None)  # NumPy fails to load if it is invalid; no output has a date
     try:
         options = _options(arguments)
-        with _facts_beside(getattr(options, "output", None) or getattr(options, "export", None)):
+        output = getattr(options, "output", None) or getattr(options, "export", None)
+        _check_output(options, output)
+        with _facts_beside(output):
             status: int = options.call(options)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -121,6 +124,21 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     # exceptions contain the FMU's errors already
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     return options
+
+
+def _check_output(options: argparse.Namespace, output: str | None) -> None:
+    """Refuse an output that replaces an input, or, with --overwrite, a folder that contains one."""
+    if output is None:
+        return
+    given = {name: getattr(options, name, None) for name in INPUTS}
+    if isinstance(given["robot"], str):  # the name of a robot, not a file
+        del given["robot"]
+    new, overwrites = os.path.realpath(output), getattr(options, "overwrite", False)
+    for text in (str(each) for it in given.values() if it for each in (it if isinstance(it, list) else [it])):
+        names = text, text.rpartition(":")[0] or text, text.partition("=")[2] or text  # BAG:ROBOT, BAG:TOPIC, NAME=FMU
+        for path in map(os.path.realpath, names):
+            if path == new or (overwrites and path.startswith(os.path.join(new, ""))):
+                raise CommandLineError(f"'{output}' would replace the input '{text}'; give another output")
 
 
 def _facts_beside(output: str | None) -> AbstractContextManager[object]:

@@ -80,13 +80,15 @@ def _robot(options: argparse.Namespace) -> ET.Element:
     path = _file(options)
     if path is None:
         return ET.Element("robot")
+    from ..plant.urdf import parse_robot
+
     if path.suffix in (".urdf", ".xacro"):
         from ..export.urdf_source import read_text
 
-        return ET.fromstring(read_text(path, None))
+        return parse_robot(read_text(path, None))
     from ..bag.provenance import read_provenance, robot_in
 
-    return ET.fromstring(str(read_provenance(*robot_in(path))["urdf"]))
+    return parse_robot(str(read_provenance(*robot_in(path))["urdf"]))
 
 
 Keywords = dict[str, Any]

@@ -14,8 +14,7 @@ from math import tau
 from pathlib import Path
 
 from ..errors import BuildError, choice
-from ..files import read_file, refusing
-from ..plant.urdf import MAX_URDF, RobotError, Urdf, read_urdf
+from ..plant.urdf import RobotError, Urdf, parse_robot, read_urdf
 from .fmu_options import FmuOptions
 from .urdf_source import last_links, read_text
 
@@ -92,12 +91,10 @@ def _semantics(path: Path) -> ET.Element:
     fitting = [file for file in files if path.stem.startswith(file.stem)]
     if not fitting:
         return ET.Element("robot")
-    with refusing(BuildError, f"read '{fitting[0]}'"):
-        text = read_file(fitting[0], MAX_URDF)
     try:
-        return ET.fromstring(text)
-    except ET.ParseError as error:
-        raise BuildError(f"'{fitting[0]}' is not XML: {error}") from error
+        return parse_robot(read_text(fitting[0], None), "SRDF")
+    except RobotError as error:
+        raise BuildError(f"'{fitting[0]}': {error}") from error
 
 
 def _home(semantics: ET.Element, urdf: Urdf) -> dict[str, float]:

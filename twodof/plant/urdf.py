@@ -121,7 +121,7 @@ def read_urdf(text: str) -> Urdf:
     Raises:
         RobotError: an element is not supported; the message names the joint, link or attribute.
     """
-    tree = _parse(text)
+    tree = parse_robot(text)
     links = _by_name(tree, "link")
     elements = _by_name(tree, "joint")
     moving = [name for name, joint in elements.items() if joint.get("type") != "fixed"]
@@ -157,24 +157,25 @@ def _listed(what: str, names: Sequence[str]) -> str:
     return f"{what}{'s' if len(names) > 1 else ''} {quoted}"
 
 
-def _parse(urdf: str) -> ET.Element:
+def parse_robot(urdf: str, what: str = "URDF") -> ET.Element:
+    """Return the root of a URDF or SRDF, an untrusted text of limited size without entities, or raise RobotError."""
     if len(urdf) > MAX_URDF:  # parsed elements take thirty times the memory of the text
-        raise RobotError(f"the URDF has {len(urdf)} characters; at most {MAX_URDF} are supported")
+        raise RobotError(f"the {what} has {len(urdf)} characters; at most {MAX_URDF} are supported")
     if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
-        raise RobotError("the URDF has a document type declaration; remove it")
+        raise RobotError(f"the {what} has a document type declaration; remove it")
     try:
         tree = ET.fromstring(urdf)
     except (ET.ParseError, ValueError) as error:
-        raise RobotError(f"the URDF is not XML: {error}") from error
+        raise RobotError(f"the {what} is not XML: {error}") from error
     if tree.tag != "robot":
-        raise RobotError(f"the URDF's root element is <{tree.tag}>, expected <robot>")
+        raise RobotError(f"the {what}'s root element is <{tree.tag}>, expected <robot>")
     depth, level, count = 1, [tree], 1
     while level := [child for element in level for child in element]:
         depth, count = depth + 1, count + len(level)
         if count > MAX_ELEMENTS:
-            raise RobotError(f"the URDF has more than {MAX_ELEMENTS} elements")
+            raise RobotError(f"the {what} has more than {MAX_ELEMENTS} elements")
         if depth > MAX_DEPTH:  # XML writers descend by recursion
-            raise RobotError(f"the URDF's elements are nested deeper than {MAX_DEPTH}")
+            raise RobotError(f"the {what}'s elements are nested deeper than {MAX_DEPTH}")
     return tree
 
 
