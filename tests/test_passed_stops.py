@@ -267,7 +267,7 @@ def test_a_solver_that_enters_no_event_mode_is_warned(importer):
 
 
 def test_a_step_that_the_engine_cannot_integrate_is_warned_of(importer):
-    solver = importer({**TOUCH, "max_step": 1e-9})
+    solver = importer({**TOUCH, "max_step": 1e-10})
     solver.run(0.1, 5e-4)
     ((status, text),) = solver.messages
     assert status == WARNING and "joint 'joint2' reversed at a limit in the solver's step to " in text
