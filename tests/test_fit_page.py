@@ -78,6 +78,23 @@ def test_a_page_has_the_verdict_the_parameters_and_the_curves(result: twodof.Fit
         np.testing.assert_allclose(rest, measured - after, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("after", "deviation", "row"),
+    [
+        (0.149999726, 1.4e-6, ("0.1499997", "0.1499970 … 0.1500025")),
+        (1.742e-12, 2e-5, ("0.000000", "0.000000 … 0.000039")),
+        (2.0, 0.0104, ("2.000", "1.980 … 2.020")),
+        (1234.5, 210.0, ("1234", "822.9 … 1646")),
+    ],
+)
+def test_values_have_the_digits_that_their_intervals_have(
+    after: float, deviation: float, row: tuple[str, str], result: twodof.Fit
+) -> None:
+    low, high = max(0.0, after - 1.96 * deviation), after + 1.96 * deviation
+    own = result.parameters[0]._replace(after=after, deviation=deviation, low=low, high=high)
+    assert replace(result, parameters=(own,)).rows[1][2:4] == row
+
+
 def test_the_verdict_on_a_hidden_spring_names_the_joint(tmp_path: Path) -> None:
     q, effort = noisy(arm_motion(stiffness=[0.0, 0.1]))
     page = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort), FREE, gravity=GRAVITY).page().decode()

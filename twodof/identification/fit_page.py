@@ -22,7 +22,7 @@ STYLES = (
     LineStyle("model after the fit", COLOURS[1], ()),
 )
 BEFORE = 1  # index of its style
-WIDTHS, DEPTHS = (THIN, THIN, CURVE), (2.0, 1.5, 2.5)
+WIDTHS, DEPTHS = (THIN, THIN, 2.0 * CURVE), (2.5, 1.5, 2.0)  # the measured curve is a line on the model's band
 MOST_OPEN = 15  # rows of a table that is not folded
 SPACE = 1.0  # s between two stretches on the time axis
 BAND = "grey band: held out"
@@ -83,7 +83,7 @@ def _figures(joints: Mapping[str, str], curves: Sequence[Curve]) -> Iterator[Cha
         lines = [(curve.effort[:, i], *curve.modelled[:, :, i]) for curve in curves]
         rows[f"Effort of {joint} in {unit}; {BAND}"] = [_panel("tau", joint, unit, times, lines)]
         rest = [(none := np.full_like(effort, np.nan), none, effort - after) for effort, _, after in lines]
-        rows[f"Residual of {joint} in {unit}: measured less model"] = [_panel("residual", joint, unit, times, rest)]
+        rows[f"Measured less model, {joint} in {unit}"] = [_panel("residual", joint, unit, times, rest)]
     figure = _stacked(rows, times)
     band = {
         "type": "rect",
@@ -102,9 +102,7 @@ def _figures(joints: Mapping[str, str], curves: Sequence[Curve]) -> Iterator[Cha
         times, rows = _times(curves), {}
         for i, (joint, unit) in enumerate(joints.items()):
             lines = [(curve.measured[:, i], *curve.simulated[:, :, i]) for curve in curves]
-            rows[f"Position of {joint} in {unit}, simulated for {WINDOW:g} s each"] = [
-                _panel("q", joint, unit, times, lines)
-            ]
+            rows[f"Position of {joint} in {unit}; windows of {WINDOW:g} s"] = [_panel("q", joint, unit, times, lines)]
         yield _stacked(rows, times)
 
 
@@ -130,7 +128,7 @@ def _panel(kind: str, joint: str, unit: str, times: Sequence[Array], lines: Sequ
     for i, style in enumerate(STYLES):
         y = _joined([line[i] for line in lines])
         if not np.isnan(y).all():
-            pen = (style.colour, WIDTHS[i], style.dashes, "", DEPTHS[i])
+            pen = (style.colour, THIN if kind == "residual" else WIDTHS[i], style.dashes, "", DEPTHS[i])
             strokes.append(Stroke(style.label, i, _joined(times), y, *pen, joint=joint, kind=kind))
     values = np.concatenate([stroke.y for stroke in strokes if stroke.track != BEFORE])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))

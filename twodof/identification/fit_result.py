@@ -38,11 +38,9 @@ class FittedParameter(NamedTuple):
     """A free parameter before and after a fit.
 
     Attributes:
-        name: name of the parameter, as in patterns.
-        unit: FMI unit name, or "".
+        name, unit: name of the parameter, as in patterns, and FMI unit name, or "".
         before, after: values before and after the fit.
-        deviation: standard deviation of the fitted value.
-        low, high: 95 % interval.
+        deviation, low, high: standard deviation and 95 % interval of the fitted value.
         known: whether the data determine the value; if not, it keeps its value.
     """
 
@@ -64,8 +62,7 @@ class Fit:
         urdf: name of the URDF's file.
         bags: paths of the bags.
         fitted_urdf: text of the URDF with fitted numbers.
-        joints: names of the robot's n joints.
-        units: "rad" or "m" of each joint.
+        joints, units: names of the robot's n joints, and "rad" or "m" of each.
         parameters: the free parameters.
         unseen: parameters that form each direction that the data do not determine.
         misfits: test of the model at each joint.
@@ -118,10 +115,11 @@ class Fit:
         """Cells of the table: name, before, after, 95 % interval, unit."""
         rows = [("parameter", "before", "after", "95 % interval", "unit")]
         for p in self.parameters:
-            interval = (
-                f"{p.low:.4g} … {p.high:.4g}" if p.known else ("not determined" if self.converged else "not known")
-            )
-            rows.append((p.name, f"{p.before:.4g}", f"{p.after:.4g}", interval, p.unit))
+            after, interval = f"{p.after:.4g}", "not determined" if self.converged else "not known"
+            if p.known:
+                after, low, high = (_rounded(value, p.deviation) for value in (p.after, p.low, p.high))
+                interval = f"{low} … {high}"
+            rows.append((p.name, f"{p.before:.4g}", after, interval, p.unit))
         return rows
 
     @property
@@ -284,9 +282,7 @@ class Fit:
         if self.unseen:
             tables["Only together: what the data do not determine"] = [("combination",), *zip(self.unseen)]
         if self.deviation:
-            worst = max(
-                range(len(self.joints)), key=lambda i: (not math.isfinite(self.deviation[i]), self.deviation[i])
-            )
+            worst = int(np.argmax(self.deviation))  # the first NaN, if there is one
             _, _, _, after, before = self._joint_rows[1 + worst]
             lines.append(
                 f"held out: simulated positions are off by at most {after} (rms, '{self.joints[worst]}'),"
@@ -301,9 +297,8 @@ class Fit:
 
     @property
     def _joint_rows(self) -> list[tuple[str, ...]]:
-        rows = [
-            ("joint", "noise of the effort", "slow residuals", *["off, held out", "before"][: 2 * len(self.deviation)])
-        ]
+        head = "joint", "noise of the effort", "slow residuals", "off, held out", "before"
+        rows: list[tuple[str, ...]] = [head if self.deviation else head[:3]]
         for i, (joint, unit) in enumerate(zip(self.joints, self.units)):
             part = f"{100 * self.misfits[i].part:.2g} % of the effort" + ", not noise" * self.misfits[i].bad
             off = [each[i] for each in (self.deviation, self.deviation_before) if each]
@@ -343,6 +338,12 @@ def check_folder(folder: str | Path) -> Path:
     if os.path.lexists(path):
         raise InputError(f"'{path}' exists, and is not replaced: remove it, or give another `output`")
     return path
+
+
+def _rounded(value: float, deviation: float) -> str:
+    """Return a value with as many decimals as its standard deviation has up to its second significant digit."""
+    decimals = 1 - math.floor(math.log10(deviation)) if deviation > 0.0 else -1
+    return f"{round(value, decimals) + 0.0:.{decimals}f}" if 0 <= decimals <= 9 else f"{value:.4g}"
 
 
 def _finite(value: float) -> float | None:
