@@ -309,6 +309,9 @@ def data_file(*parts: str) -> Path:
     return installed if installed.exists() else package.parent.joinpath(*parts)
 
 
+JsonObject = dict[str, Any]
+
+
 def parsed(text: bytes) -> Any:
     """Parse untrusted JSON; "?" replaces surrogates, which UTF-8 does not have.
 

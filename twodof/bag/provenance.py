@@ -11,7 +11,7 @@ from urllib.parse import quote, unquote
 
 from ..bounds import CHANGE, MAX_HELD, MAX_NAME, MAX_PROVENANCE, MAX_ROBOTS, MAX_VARIABLES, MIB
 from ..errors import BagError
-from ..files import NUMBER, VALUES, fits, parsed, read_file
+from ..files import NUMBER, VALUES, JsonObject, fits, parsed, read_file
 from ..fmu import System
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Changes, Value
@@ -77,7 +77,7 @@ class Provenance(TypedDict, total=False):
     input_changes: list[list[Any]]
     inputs_known_until: float
     commanders: list[object]
-    verdict: dict[str, Any]
+    verdict: JsonObject
 
 
 class ProvenanceFile:
@@ -99,13 +99,13 @@ class ProvenanceFile:
             most = (MAX_PROVENANCE - MAX_TAIL) // MIB
             raise BagError(f"cannot write '{self.path}': {much}; at most {most} are stored")
         self._run, self._commanders = run, len(run.commanders)
-        self._verdict: dict[str, object] | None = None
+        self._verdict: JsonObject | None = None
         self._until: float | None = None
         self.path.write_bytes(self._head + self._tail())
         self._start, self._end = run.start_time, len(self._head)
         self._separator, self._full = b"", False
 
-    def add(self, changes: Changes, verdict: dict[str, object] | None = None) -> None:
+    def add(self, changes: Changes, verdict: JsonObject | None = None) -> None:
         """Append times and the inputs that changed at them, up to the size that readers accept, and set the verdict."""
         commanders = len(self._run.commanders)
         same = commanders == self._commanders and verdict is self._verdict

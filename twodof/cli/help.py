@@ -1,14 +1,19 @@
 """Help texts: examples of each verb, and hints for mistyped command lines."""
 
+from __future__ import annotations
+
 import argparse
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import choice, nearest
 from ..plant.numerals import number, whole_number
 from .printing import plain
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 EXAMPLES = {
     "": ["twodof build", "twodof run", "twodof help run"],
@@ -127,10 +132,10 @@ class Parser(argparse.ArgumentParser):
             message += f": {action.metavar or action.dest.upper()}, {action.help}"
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 
-    def _print_message(self, message: str, file: Any = None) -> None:
+    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
         """Write help; raise an error of the write, which argparse ignores if output is unbuffered."""
-        if file is sys.stdout is not None:
-            sys.stdout.write(message)
+        if file is not None and file is sys.stdout:
+            file.write(message)
         else:
             super()._print_message(message, file)
 

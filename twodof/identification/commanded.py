@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from ..plant.urdf import RobotError
 from ..plant.variables import Value, Variable, variable_table
 from .stretches import Array
 
-Values = Mapping[str, Any]
+Values = Mapping[str, object]
 LAWS = {"quat_des[1]": "pose", "x_des[1]": "task", "q_des[1]": "joint", "tau_cmd[1]": "effort"}
 """Control law by an input that only it and those after it have."""
 SAME = 1e-6  # largest difference of recorded efforts from those of the law, as part of the largest effort

@@ -16,7 +16,7 @@ import logging
 from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.optimize import differential_evolution
@@ -159,9 +159,9 @@ class _Design:
         stretch = Stretch(0, t, q, q, v, a, np.zeros_like(q), moving, band)
         return stretch._replace(tau=efforts(self._robot, self._values, stretch))
 
-    def _moved(self, shape: Array, step: float) -> tuple[Any, Any, Any, Any]:
+    def _moved(self, shape: Array, step: float) -> tuple[Array, Array, Array, Array]:
         """Return times, positions and their derivatives."""
-        t, k = step * np.arange(round(self._seconds / step) + 1), self._harmonics
+        k, t = self._harmonics, np.asarray(step * np.arange(round(self._seconds / step) + 1), np.float64)
         w = 2.0 * np.pi * k / self._seconds
         a = shape[:, 0] - shape[:, 0].mean(axis=1, keepdims=True)
         b = shape[:, 1] - np.outer(shape[:, 1] @ k, k / (k @ k))

@@ -14,7 +14,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ..bag.storage import profile
 from ..bounds import MAX_HEAD, MAX_SOURCES, MIB
 from ..errors import BuildError, PageError
 from ..export.compiler import compile_web_module, compiles_for_the_web, standard_headers
-from ..files import data_file, head_of, read_member, refusing, write_file
+from ..files import JsonObject, data_file, head_of, read_member, refusing, write_file
 from ..fmu import Fmu, opened, resource_reader
 from ..geometry.kinematics import Kinematics, Placement, quaternions
 from ..geometry.shapes import Shape, link_shapes, sphere
@@ -62,7 +62,7 @@ class Arm(NamedTuple):
         shapes: shapes of the links.
     """
 
-    facts: dict[str, Any]
+    facts: JsonObject
     urdf: str
     shapes: Sequence[Shape]
 

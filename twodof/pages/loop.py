@@ -11,11 +11,11 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from threading import Condition
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
-from ..files import free_name
+from ..files import JsonObject, free_name
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Setting, Value, check_going_on, resolve
 from ..simulation.pace import RealTime
@@ -174,7 +174,7 @@ class Loop:
             self._notes.append(text)
             self._noted += 1
 
-    def news(self, run: int = 0, seen: int = 0) -> dict[str, Any]:
+    def news(self, run: int = 0, seen: int = 0) -> JsonObject:
         """Return an update for a page since its last one; callable from any thread.
 
         Args:

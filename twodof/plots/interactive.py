@@ -8,12 +8,12 @@ import base64
 import html
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from ..errors import PlotError
 from ..export.closed_form import Array
+from ..files import JsonObject
 from ..version import needing
 from .panels import CURVE, HELD, KINDS, TARGET, LineStyles, Panel, duration, joint_names, panels_of
 from .scripts import packed, script
@@ -30,7 +30,7 @@ ROW, GAP, EDGE, TOP = 150, 34, 44, 50
 """Height of a panel, distance between panels, and margins below and above all panels, pixels. The margin above has
 space for the heading and plotly's buttons.
 """
-Chart = dict[str, Any]
+Chart = JsonObject
 """A figure of plotly, or a part of one, as JSON."""
 LAYOUT: Chart = {
     "font": {"family": "sans-serif", "size": 12, "color": INK},

@@ -5,19 +5,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..notebook import in_notebook
 from .sample import Sample, Sink, TakeRows
 
 if TYPE_CHECKING:
+    from tqdm import tqdm
+
     from .experiments import Experiment
 
 SILENCE = 1.0  # s until a notebook shows a bar
 BAR = "{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left"
 
 
-def _bar(what: str, unit: str, **options: Any) -> Any:
+def _bar(what: str, unit: str, **options: object) -> tqdm:
     """Return a bar of tqdm that disappears at its end: a widget if the notebook has widgets, else text."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ipywidgets may be missing
@@ -29,7 +31,7 @@ def _bar(what: str, unit: str, **options: Any) -> Any:
 def counting(what: str, unit: str, *, shown: bool) -> Iterator[Callable[[int, int], None]]:
     """Return a callback that shows the numbers of finished and of all runs in a bar, or does nothing."""
     with ExitStack() as stack:
-        bar: Any = None
+        bar: tqdm | None = None
 
         def show(done: int, total: int) -> None:
             nonlocal bar

@@ -11,13 +11,12 @@ import os
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SweepError, no_such
-from ..files import is_being_written, lock, parsed, refusing, write_file
+from ..files import JsonObject, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
 from ..simulation.verdict import METRICS
 from ..version import needing
@@ -180,7 +179,7 @@ def read_sweep(path: str | Path) -> pandas.DataFrame:
     return rows
 
 
-def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
+def _check_same(path: Path, there: JsonObject, wanted: JsonObject) -> None:
     wanted = parsed(json.dumps(wanted).encode())
     for key in COMPARED:
         if there[key] != wanted[key]:

@@ -8,14 +8,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from math import prod
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..bounds import MAX_NAME, MAX_NUMBER, MAX_PROVENANCE, MAX_RUNS, MAX_SETTINGS, MAX_SWEEP, MAX_VARIED
 from ..children import memory_for
 from ..errors import SweepError
-from ..files import NUMBER, VALUES, check_file, fits, parsed
+from ..files import NUMBER, VALUES, JsonObject, check_file, fits, parsed
 from ..simulation.verdict import METRICS
 from ..version import needing
 from .design import OWN_COLUMNS
@@ -155,11 +154,11 @@ def _damaged(file: Path) -> SweepError:
     return SweepError(f"cannot read '{file}': it is damaged")
 
 
-def provenance_in(file: Path, schema: pa.Schema) -> dict[str, Any]:
+def provenance_in(file: Path, schema: pa.Schema) -> JsonObject:
     """Return the provenance in a table's schema; raise SweepError if it is not valid."""
     try:
         text = (schema.metadata or {})[KEY]
-        provenance: dict[str, Any] = parsed(text) if len(text) <= MAX_PROVENANCE else {}
+        provenance: JsonObject = parsed(text) if len(text) <= MAX_PROVENANCE else {}
         if not fits(provenance, SHAPE):
             raise ValueError
         design = provenance["design"]
