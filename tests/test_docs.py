@@ -195,6 +195,13 @@ def test_readme_is_short_and_has_the_command_of_the_tests():
     assert f"\n    {command}\n".encode() in readme  # .ci/run takes it from there
 
 
+def test_change_log_changes_nothing_that_was_not_released():
+    text = (ROOT / "CHANGELOG.md").read_text()
+    released = re.findall(r"^## \[\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d$", text, re.M)
+    assert text.count("\n## ") == 1 + len(released) and "\n## [Unreleased]\n" in text
+    assert released or not re.search(r"^### (Changed|Fixed|Deprecated|Removed)$", text, re.M)
+
+
 def test_every_public_name_is_on_the_page_of_functions():
     told = re.findall(r"^::: twodof\.(\w+)$", (DOCS / "api.md").read_text("utf-8"), re.MULTILINE)
     assert len(told) == len(set(told))
