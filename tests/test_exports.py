@@ -6,6 +6,8 @@ import json
 import shutil
 import tempfile
 import tracemalloc
+from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -38,25 +40,45 @@ NAMES = [
 UNITS = ["s", *("rad", "rad/s", "N·m") * 2, *["m"] * 4]
 
 
-def columns(bag: twodof.Recording) -> np.ndarray:
-    joints = [part[:, i] for i in range(2) for part in (bag.q, bag.v, bag.tau)]
-    return np.column_stack([bag.t, *joints, bag.x, bag.target])
+def decoded(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Return stamps, ns, and messages of each topic in an MCAP file, by the readers of MCAP."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        for _, channel, message, content in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, content))
+    return found
 
 
-def test_a_csv_has_each_value_to_the_last_bit(bag_path, tmp_path):
-    assert main(["export", str(bag_path), "-o", str(tmp_path / "out.csv")]) == 0
-    with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
-    assert header == [f"{name} [{unit}]" for name, unit in zip(NAMES, UNITS)]
-    assert np.array_equal(np.array(rows, float), columns(twodof.read_bag(bag_path)))
+def columns(bag: Path) -> np.ndarray:
+    """Return the columns of a table of a bag by the readers of MCAP."""
+    topics = decoded(bag / f"{bag.name}.mcap")
+    points = [[(m.point.x, m.point.y) for _, m in topics[name]] for name in ("/end_effector", "/target")]
+    stamps, states = zip(*topics["/joint_states"])
+    joints = [[getattr(m, part)[i] for m in states] for i in range(2) for part in ("position", "velocity", "effort")]
+    return np.column_stack([(np.array(stamps) - stamps[0]) / 1e9, *joints, *points])
 
 
-def test_a_parquet_file_is_read_by_another_program(bag_path, tmp_path):
-    path = twodof.export_bag(bag_path, tmp_path / "out.parquet")
-    found = duckdb.read_parquet(str(path))
-    assert found.columns == NAMES
-    assert np.array_equal(np.array(found.fetchall()), columns(twodof.read_bag(bag_path)))
-    assert pandas.read_parquet(path).attrs["units"] == dict(zip(NAMES, UNITS))
+@pytest.mark.parametrize("compress", ["", "zstd"])
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_pandas_and_duckdb_read_the_messages_of_a_bag_in_its_table(ending, compress, native_path, tmp_path):
+    """All values are equal to the last bit."""
+    bag, path = tmp_path / "bag", tmp_path / f"out.{ending}"
+    sink = twodof.Bag(bag, scene=True, effort=True, compress=compress)
+    twodof.simulate(native_path, sink, stop_time=0.5, changes=[(0.25, {"x_des": (0.1, 0.2)})])
+    assert main(["export", str(bag), "-o", str(path)]) == 0
+    headers, expected = [f"{name} [{unit}]" for name, unit in zip(NAMES, UNITS)], columns(bag)
+    assert len(expected) == 51 and np.ptp(expected, axis=0).min() > 1e-3
+    if ending == "csv":
+        table = pandas.read_csv(path, float_precision="round_trip")
+        other = duckdb.read_csv(str(path), header=True, all_varchar=True)
+    else:
+        table, other = pandas.read_parquet(path), duckdb.read_parquet(str(path))
+        assert table.attrs["units"] == dict(zip(NAMES, UNITS))
+    assert [*table.columns] == other.columns == (headers if ending == "csv" else NAMES)
+    for found in (table.to_numpy(), np.array(other.fetchall(), float)):
+        assert np.array_equal(found, expected)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -64,10 +86,11 @@ def test_one_mcap_file_has_all_messages(storage, native_path, tmp_path):
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag", storage=storage, scene=True), stop_time=0.3)
     path = twodof.export_bag(tmp_path / "bag", tmp_path / "out.mcap")
     with path.open("rb") as file:
-        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        found = sorted((channel.topic, message.log_time) for _, channel, message, _ in decoded)
+        messages = make_reader(file).iter_messages()
+        found = sorted((channel.topic, message.log_time, message.data) for _, channel, message in messages)
     with Reader(tmp_path / "bag") as reader:
-        assert found == sorted((c.topic, stamp) for c, stamp, _ in reader.messages())
+        assert found == sorted((c.topic, stamp, bytes(data)) for c, stamp, data in reader.messages())
+    assert [len(each) for each in decoded(path).values()].count(31) == 4
     single, whole = twodof.read_bag(path), twodof.read_bag(tmp_path / "bag")
     assert np.array_equal(single.q, whole.q) and single.provenance["urdf"] == whole.provenance["urdf"]
 
