@@ -169,6 +169,23 @@ def test_a_failed_run_has_no_line(robot: str, control: str, settings: dict[str, 
 
 
 @pytest.mark.parametrize(
+    ("robot", "control", "settings"),
+    [
+        ("panda", "joint", {"tau_ext": (0.0, -9.5, 8.0, 7.0, 1.5, 0.0, 0.2)}),
+        ("arm", "task", {"tau_ext": (0.0, 0.3)}),
+        ("arm", "task", {"f_ext": (0.0, -3.0, 0.0)}),
+    ],
+)
+def test_the_page_names_the_same_joints_and_units_of_a_load(robot: str, control: str, settings: dict[str, Any]) -> None:
+    kept = Kept()
+    verdict = twodof.simulate(fmu_of(robot, control), kept, settings=settings).verdict
+    (text,) = (cause.text for cause in verdict.causes if cause.subject == [*settings][0])
+    found = page_causes(kept.run, kept.samples)[0]
+    assert found["text"].replace("\u2212", "-") == text.partition(";")[0]
+    assert found["subject"] == [*settings][0]
+
+
+@pytest.mark.parametrize(
     ("name", "change"),
     [
         ("a direction without a gain, and a target just out of reach", {"Kp": 50.0}),

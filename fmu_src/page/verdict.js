@@ -240,13 +240,20 @@ export class Verdict {
       found.push(cause("load", `${unknown} payload of ${short(payload)} kg`, (payload * 9.81) / most, -1, "payload"));
     for (const group of ["tau_ext", "f_ext"])
       if (session.held(group).some((value) => Math.abs(value) > SLIGHT * most))
-        found.push(cause("load", `the controller does not know ${group} = (${session.held(group).map(short).join(", ")})`, Math.max(...session.held(group).map(Math.abs)) / most, -1, group));
+        found.push(cause("load", `the controller does not know ${this.external(group)}`, Math.max(...session.held(group).map(Math.abs)) / most, -1, group));
     /** @type {(own: (damping: number, i: number) => boolean) => string[]} */
     const damped = (own) => session.held("damping").flatMap((size, i) => (own(size, i) ? [`'${this.joints[i].name}'`] : []));
     const heavy = damped((size, i) => size > 2 * this.joints[i].damping), some = damped((size) => size > 0);
     if (heavy.length) found.push(cause("load", `${unknown} damping of joints ${heavy.join(", ")}`, 1, -1, "damping"));
     else if (some.length && this.drags()) found.push(cause("drag", `${unknown} damping of joints ${some.join(", ")} in the URDF`));
     return found;
+  }
+
+  /** @type {(group: string) => string} A force, or the largest three torques with their joints. */
+  external(group) {
+    const values = this.session.held(group), own = [...values.keys()].filter((i) => values[i]).sort((i, j) => Math.abs(values[j]) - Math.abs(values[i]));
+    if (group === "f_ext") return `${group} = (${values.map(short).join(", ")}) N`;
+    return own.slice(0, 3).map((i) => `${group}[${i + 1}] (of joint '${this.joints[i].name}') = ${short(values[i])} ${forceUnit(this.joints[i])}`).join(", ") + (own.length > 3 ? ` and ${own.length - 3} more` : "");
   }
 
   /** Whether damping needs a part of the late effort of a joint with an error. */
