@@ -179,10 +179,10 @@ def test_a_failed_run_has_no_line(robot: str, control: str, settings: dict[str, 
 def test_the_page_names_the_same_joints_and_units_of_a_load(robot: str, control: str, settings: dict[str, Any]) -> None:
     kept = Kept()
     verdict = twodof.simulate(fmu_of(robot, control), kept, settings=settings).verdict
-    (text,) = (cause.text for cause in verdict.causes if cause.subject == [*settings][0])
+    (text,) = (cause.text for cause in verdict.causes if cause.subject == next(iter(settings)))
     found = page_causes(kept.run, kept.samples)[0]
     assert found["text"].replace("\u2212", "-") == text.partition(";")[0]
-    assert found["subject"] == [*settings][0]
+    assert found["subject"] == next(iter(settings))
 
 
 @pytest.mark.parametrize(
