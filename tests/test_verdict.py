@@ -161,6 +161,7 @@ def test_errors_of_joints_that_turn_and_slide_have_no_common_size(tmp_path: Path
         ("panda", "pose", {"Kp": (50.0, 50.0, 0.0), "x_des": (0.36, -0.05, 0.45)}, "damping of any joint"),  # at rest
         ("arm", "joint", {"friction": (0.3, 0.1), "q_des": (1.2, 0.1), "Kd": 200.0}, "still approach"),  # it sticks
         ("ur5", "joint", {"payload": 40.0, "payload_known": True, "limit_effort": True}, "peak effort"),  # saturated
+        ("so100", "task", {"x_des": (0.6, 0.2, 0.5), "Kd": 0.5}, "everything else"),  # most of it is out of reach
     ],
 )
 def test_a_failed_run_has_no_line(robot: str, control: str, settings: dict[str, Any], text: str) -> None:
@@ -183,6 +184,14 @@ def test_the_page_names_the_same_joints_and_units_of_a_load(robot: str, control:
     found = page_causes(kept.run, kept.samples)[0]
     assert found["text"].replace("\u2212", "-") == text.partition(";")[0]
     assert found["subject"] == next(iter(settings))
+
+
+def test_the_page_names_the_noise_of_a_sensor() -> None:
+    settings = {"v_noise": 3.0, "control_period": 0.01, "Kd": 80.0, "Kp": 60.0, "q_des": (0.7, 0.2)}
+    kept = Kept()
+    lines = twodof.simulate(fmu_of("arm", "joint"), kept, settings=settings).verdict.lines
+    assert (noise := re.search(r"v_noise\[\d\] = 3 rad/s", lines[0])) is not None, lines
+    assert noise[0] in page_causes(kept.run, kept.samples)[0]["text"]
 
 
 @pytest.mark.parametrize(

@@ -271,8 +271,8 @@ export class Verdict {
     const { session, joints } = this, last = session.count - 1, first = Math.max(0, last + 1 - TAIL);
     const [period, delay] = ["control_period", "control_delay"].map((name) => Number(session.values.get(name) ?? 0));
     if (!period || last - first < 15) return [];
-    /** @type {(i?: number) => string} Settings of the controller and of a joint's encoder. */
-    const settings = (i) => ["control_period", "control_delay", `q_resolution[${i}]`].flatMap((name) => {
+    /** @type {(i?: number) => string} Settings of the controller and of a joint's sensors. */
+    const settings = (i) => ["control_period", "control_delay", ...["q_resolution", "q_noise", "v_noise"].map((each) => `${each}[${i}]`)].flatMap((name) => {
       const value = Number(session.values.get(name) ?? 0);
       return value ? [`${name} = ${short(value)} ${this.session.variable(name).unit}`] : [];
     }).join(", ");

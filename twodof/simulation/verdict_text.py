@@ -65,7 +65,7 @@ def lines_of(
         together,
         *(text for text in also if NEXT in text),
         *notes,
-        _remainder(parts),
+        "" if any(cause.kind == "reach" for cause in why) else _remainder(parts),  # its distance is printed
         _response(judge, outcome, motion, numbers, why),
         _peaks(judge, why, outcome),
         settings,
