@@ -67,6 +67,9 @@ MISTAKES: dict[str, str] = {
     "run --robot panda": "names a component of a system; .* build a robot with 'twodof build --robot panda'",
     "build robot.urdf --fmi 3.0": "'3.0' is not a whole number",
     "build --split -o arms.fmu": "'arms.fmu': the name of a system of FMUs ends in .ssp",
+    f"{RUN} --native=yes": "error: --native takes no value; leave out 'yes'",
+    "export bag x.csv": "an export needs the name of its file, as in -o x.csv",
+    "sweep arm.fmu -o s": "there is nothing to vary; give values of an input with --grid",
     "info bag --cost settling": "--cost ranks the runs of a sweep, and 'bag' is not a sweep; leave it out",
     "fit bag robot.urdf --free payload": "the URDF comes first: twodof fit robot.urdf bag",
     # paths
@@ -79,6 +82,9 @@ MISTAKES: dict[str, str] = {
     "run x.fmu": "no FMU 'x.fmu'; make one with 'twodof build'",
     "run missing/arm.fmu": "no FMU 'missing/arm.fmu': there is no folder 'missing'",
     "run notes.txt": "'notes.txt' is not an FMU",
+    "plot notes.txt": "'notes.txt' is not a bag; make one with 'twodof run'",
+    "build https://example.org/r.urdf": "'https:/example.org/r.urdf' is a web address, .*; download the URDF first",
+    f"{RUN} --input arm.fmu": "'arm.fmu' is not a CSV: it is an FMU",
     "live bag": "'bag' is not an FMU: it is a bag",
     "page bag": "'bag' is not an FMU: it is a bag",
     "layouts bag": "'bag' is not an FMU: it is a bag",
@@ -114,6 +120,8 @@ MISTAKES: dict[str, str] = {
     f"{RUN} --input lower.csv": "no variable 'kp'; did you mean 'Kp'",
     # settings
     f"{RUN} --set x_des_1=0.2": r"'x_des_1'; did you mean 'x_des\[1\]'",
+    f"{RUN} --set x_des_y=0.2": r"'x_des_y'; did you mean 'x_des\[2\]'",
+    f"{RUN} --input exported.csv": r"'x_des.x \[m\]'; did you mean 'x_des\[1\]'",
     f"{RUN} --set x_des2=0.2": r"'x_des2'; did you mean 'x_des\[2\]'",
     f"{RUN} --set x_des[0]=0.2": "x_des has 2 elements",
     f"{RUN} --set zeta=0.7": "'zeta'; did you mean 'Kd'",
@@ -131,6 +139,8 @@ MISTAKES: dict[str, str] = {
     # robots
     "build robot.urdf --frame end_effector": "no frame 'end_effector' .*; did you mean 'EndEffector'",
     "build robot.urdf --frame tool0": "no frame 'tool0' .*; there are: world, link1",
+    "build robot.urdf --frame joint2": "frame 'joint2' is a joint .*; did you mean its link 'link2'",
+    "build robot.urdf --lock joint1 --lock joint2": "no joint moves a link; .*, not locked",
     "build robot.urdf --lock Joint1": "no joint 'Joint1' to lock; did you mean 'joint1'",
     "build robot.urdf --lock joint1=90deg": "'90deg' is not a number",
     "build robot.urdf --q-start 1": "q_start has 1 values, the robot has 2 joints",
@@ -144,7 +154,7 @@ MISTAKES: dict[str, str] = {
     "page arm.fmu -o .html": "'.html': the name of a page ends in .html",
     "info nothing": "there is no FMU, bag or sweep 'nothing'",
     "page arm.fmu -o page.htm": "'page.htm': the name of a page ends in .html",
-    "page arm.fmu -o arm.fmu": "'arm.fmu': the name of a page ends in .html",
+    "page arm.fmu -o arm.fmu": "'arm.fmu' would replace the input 'arm.fmu'; give another output",
     "layouts arm.fmu -o notes.txt": "cannot make the folder 'notes.txt': File exists",
     # sweeps
     "sweep arm.fmu --grid Kp=50:100 -o s": "expected NAME=LOW:HIGH:COUNT, as in --grid Kp=20:200:10",
@@ -173,6 +183,7 @@ def things(native_path, tmp_path_factory):
         "lonely.csv": "time\n0\n1\n",
         "start.csv": "time,q_start\n0,1\n",
         "united.csv": "time,Kp [1/s2]\n0,50\n",
+        "exported.csv": "time,x_des.x [m]\n0,0.2\n",
     }.items():
         (folder / name).write_text(text)
     (folder / "wide.csv").write_text("time,Kp\n0,50\n", encoding="utf-16")

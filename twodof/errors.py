@@ -170,9 +170,13 @@ def no_such(wanted: str, path: Path, *others: str) -> str:
         use = f"; use '{command} {shlex.quote(str(path))}'" if command else ""
         article = "an" if wanted.startswith("FMU") else "a"
         return f"'{path}' is not {article} {wanted}: it is {words}{use}"
+    made = f"; make one with '{MAKERS[wanted]}'" if wanted in MAKERS else ""
+    if path.exists():
+        return f"'{path}' is not a {wanted}{made}"
+    if str(path).startswith(("http:/", "https:/")):
+        return f"'{path}' is a web address, which is not read; download the {wanted} first"
     if not path.parent.is_dir():
         return f"there is no {wanted} '{path}': there is no folder '{path.parent}'"
-    made = f"; make one with '{MAKERS[wanted]}'" if wanted in MAKERS else ""
     return f"there is no {wanted} '{path}'" + (f"; did you mean '{near}'?" if near else made)
 
 

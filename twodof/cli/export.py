@@ -23,7 +23,9 @@ def call(options: argparse.Namespace) -> int:
     from ..bag.exports import export_bag
 
     if options.output is None:
-        raise InputError(f"an export needs the name of its file, as in -o {options.bags[0].name}.csv")
+        last = options.bags[-1].name
+        name = last if len(options.bags) > 1 and "." in last else f"{options.bags[0].name}.csv"
+        raise InputError(f"an export needs the name of its file, as in -o {name}")
     path = export_bag(options.bags, options.output)
     print_table(("bag", ", ".join(map(str, options.bags))), ("file", written(path)))
     return 0

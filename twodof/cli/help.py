@@ -127,6 +127,9 @@ class Parser(argparse.ArgumentParser):
         message = re.sub(r"invalid int value: ('.*')$", r"\1 is not a whole number", message)
         message = re.sub(r"invalid float value: ('.*')$", r"\1 is not a number; leave units out", message)
         message = re.sub(r"expected (\d) arguments$", r"expected \1 numbers with spaces between them", message)
+        message = re.sub(
+            r"argument (\S+): ignored explicit argument ('.*')$", r"\1 takes no value; leave out \2", message
+        )
         named = re.match(r"argument ([-\w]+)[^:]*: expected one argument$", message)
         if named and (action := self._option_string_actions.get(named[1])):
             message += f": {action.metavar or action.dest.upper()}, {action.help}"

@@ -155,6 +155,8 @@ def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
     if near is None and "." in name:  # Kp of a system, not controller.Kp
         near = nearest(name.rpartition(".")[2], [each for each in known if "." not in each], 0.6)
     unitless = re.sub(r"\s+[\[(].*$", "", name)  # Kp [1/s2] of a table
-    own = [each for each in (indexed, near, MEANT.get(name), unitless) if each in known]
+    part = re.fullmatch(r"(\w+_des|K[pd])[._]([xyz])", unitless)  # x_des.x of an exported table
+    axis = f"{part[1]}[{str(getattr(fmu, 'axes', '')).find(part[2]) + 1}]" if part else ""
+    own = [each for each in (indexed, axis, near, MEANT.get(name), unitless) if each in known]
     like = f"; did you mean '{own[0]}'?" if own else choice(name, known, ALIKE)
     return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"

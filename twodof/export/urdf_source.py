@@ -41,6 +41,8 @@ def last_links(urdf: Urdf) -> list[str]:
 
 def end_effector(urdf: Urdf, frame: str | None) -> str:
     """Return the controlled link: the given one, or the default."""
+    if frame in urdf.joints and frame not in urdf.links:
+        raise RobotError(f"frame '{frame}' is a joint in the URDF; did you mean its link '{urdf.joints[frame].child}'?")
     if frame is not None and frame not in urdf.links:
         raise RobotError(f"no frame '{frame}' in the URDF{choice(frame, urdf.links)}")
     if frame is not None:
@@ -51,7 +53,7 @@ def end_effector(urdf: Urdf, frame: str | None) -> str:
     if len(leaves) == 1:
         return leaves[0]
     if not leaves:
-        raise RobotError("there is no link that a joint moves; `lock` fewer joints")
+        raise RobotError("no joint moves a link; a robot needs a revolute, continuous or prismatic joint, not locked")
     others = [link for link in urdf.links if link not in leaves]
     raise RobotError(
         f"name the controlled link with `frame`; last links are: {', '.join(leaves)};"

@@ -120,7 +120,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
             f" other two; they are used unchanged: {links}"
         )
     if not bodies:
-        raise RobotError("the URDF has no moving joint")
+        raise RobotError("no joint moves a link; a robot needs a revolute, continuous or prismatic joint, not locked")
     if frame not in urdf.links:
         raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
     try:

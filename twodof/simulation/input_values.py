@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 
 from ..bounds import MAX_CELLS, MAX_TABLE
-from ..errors import InputError, no_such
+from ..errors import InputError, kind_of, no_such
 from ..files import check_file
 from ..fmu import Fmu, no_variable
 from ..fmu import Setting as Setting
@@ -141,6 +141,9 @@ def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"'{path}' is not UTF-8 text; save it as CSV UTF-8") from error
+        other = Path(path).suffix != ".csv" and kind_of(Path(path))
+        raise InputError(
+            no_such("CSV", Path(path)) if other else f"'{path}' is not UTF-8 text; save it as CSV UTF-8"
+        ) from error
     except csv.Error as error:
         raise InputError(f"'{path}' is not a CSV file: {error}") from error

@@ -77,7 +77,7 @@ def make_design(
             raise InputError(f"the range of {name}, {low:g} to {high:g}, does not ascend")
         limits[name] = (low, high)
     if not grids and not limits:
-        raise InputError("there is nothing to vary; give a grid, or ranges and a number of draws")
+        raise InputError("there is nothing to vary; give values of an input with `grid`")
     if limits and random < 1:
         raise InputError(f"{random} random draws of {', '.join(limits)}; give at least 1 with `random`")
     if random and not limits:
