@@ -57,15 +57,10 @@ class TopicCount:
 
 @dataclass(frozen=True)
 class ReceivedTargets:
-    """Targets received on a bag's /target: for each sample the latest one.
+    """Targets received on a bag's /target: for each sample the latest one."""
 
-    Attributes:
-        frame: frame of the points.
-        points: N × 3, m; NaN before the first one.
-    """
-
-    frame: str
-    points: Array
+    frame: str  # frame of the points
+    points: Array  # N × 3, m; NaN before the first one
 
 
 class Inputs:

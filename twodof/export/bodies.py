@@ -25,17 +25,11 @@ Frame = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body, by the parameters that enter the dynamics linearly.
+    """A rigid body, by the parameters that enter the dynamics linearly."""
 
-    Attributes:
-        mass: kg.
-        moment: mass times position of its centre of mass, kg·m, 3 values.
-        inertia: about the frame's origin, kg·m², 3 × 3.
-    """
-
-    mass: Scalar
-    moment: Array
-    inertia: Array
+    mass: Scalar  # kg
+    moment: Array  # mass times position of its centre of mass, kg·m, 3 values
+    inertia: Array  # about the frame's origin, kg·m², 3 × 3
 
     def with_point(self, mass: Scalar, offset: Array) -> Body:
         """Return the body with an added point mass."""
@@ -67,20 +61,13 @@ class Inertial(NamedTuple):
 
 @dataclass(frozen=True)
 class FreeLink:
-    """A link whose mass, centre of mass or inertia varies.
+    """A link whose mass, centre of mass or inertia varies."""
 
-    Attributes:
-        body: index of the joint that moves it.
-        R, p: pose of its frame in Pinocchio's frame of this joint.
-        given: its values in the URDF, in its own frame.
-        free: the same values with variables instead of those that vary.
-    """
-
-    body: int
-    R: Array
+    body: int  # index of the joint that moves it
+    R: Array  # R, p: pose of its frame in Pinocchio's frame of this joint
     p: Array
-    given: Inertial
-    free: Inertial
+    given: Inertial  # its values in the URDF, in its own frame
+    free: Inertial  # the same values with variables instead of those that vary
 
     def change(self, R: Array, p: Array) -> Body:
         """Return what the link adds to its body's given values, in a frame in which the link has the pose (R, p)."""
@@ -105,27 +92,17 @@ def symmetric(S: Array) -> Array:
 
 @dataclass(frozen=True)
 class JointTree:
-    """Constants of a robot whose N joints have axes along z; n of them are independent.
+    """Constants of a robot whose N joints have axes along z; n of them are independent."""
 
-    Attributes:
-        parent: parent of each joint, −1 for the root.
-        prismatic: whether each joint is prismatic.
-        R, p: pose of each joint's frame in its parent's frame at q = 0.
-        body: body that each joint moves.
-        path: joints from the root to the task frame.
-        frame_R, frame_p: pose of the task frame in the frame of the last joint of ``path``.
-        G, c: positions of all joints are G q + c.
-    """
-
-    parent: tuple[int, ...]
-    prismatic: tuple[bool, ...]
-    R: Array
+    parent: tuple[int, ...]  # parent of each joint, −1 for the root
+    prismatic: tuple[bool, ...]  # whether each joint is prismatic
+    R: Array  # R, p: pose of each joint's frame in its parent's frame at q = 0
     p: Array
-    body: tuple[Body, ...]
-    path: tuple[int, ...]
-    frame_R: Array
+    body: tuple[Body, ...]  # body that each joint moves
+    path: tuple[int, ...]  # joints from the root to the task frame
+    frame_R: Array  # frame_R, frame_p: pose of the task frame in the frame of the last joint of ``path``
     frame_p: Array
-    G: Array
+    G: Array  # G, c: positions of all joints are G q + c
     c: Array
 
 

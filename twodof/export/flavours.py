@@ -36,23 +36,15 @@ PYTHONFMU_FILES = ("_version.py", "default_experiment.py", "enums.py", "fmi2slav
 
 @dataclass(frozen=True)
 class Flavour:
-    """Files that one flavour adds.
+    """Files that one flavour adds."""
 
-    Attributes:
-        native: whether the flavour is C, with sources, Model Exchange and derivatives.
-        files: resources and sources; the GUID is a digest of them.
-        platforms: FMI platforms of the binaries.
-        signed: function that returns the files that contain the GUID, for example compiled libraries.
-        fmi: version of FMI, 2 or 3.
-        arrays: whether vectors are arrays of FMI 3.
-    """
-
-    native: bool
-    files: Files
-    platforms: Sequence[str]
+    native: bool  # whether the flavour is C, with sources, Model Exchange and derivatives
+    files: Files  # resources and sources; the GUID is a digest of them
+    platforms: Sequence[str]  # FMI platforms of the binaries
+    # function that returns the files that contain the GUID, for example compiled libraries
     signed: Callable[[str], Files]
-    fmi: int = 2
-    arrays: bool = False
+    fmi: int = 2  # version of FMI, 2 or 3
+    arrays: bool = False  # whether vectors are arrays of FMI 3
 
 
 def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Starts) -> Flavour:

@@ -26,15 +26,11 @@ STRUCTS = {"turn": "JointPosition"}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Expression:
-    """A value in C: a variable, or an operation on expressions and numbers.
-
-    Attributes:
-        serial: the position in the order of creation.
-    """
+    """A value in C: a variable, or an operation on expressions and numbers."""
 
     operation: str
     operands: tuple[Value, ...] = ()
-    serial: int = field(default_factory=count().__next__, init=False)
+    serial: int = field(default_factory=count().__next__, init=False)  # the position in the order of creation
 
     def __neg__(self) -> Value:
         return self.operands[0] if self.operation == "neg" else Expression("neg", (self,))

@@ -18,36 +18,25 @@ from .validation import NUMBERS
 
 @dataclass(frozen=True)
 class Scalar:
-    """A scalar variable, or an element of an array of FMI 3.0.
+    """A scalar variable, or an element of an array of FMI 3.0."""
 
-    Attributes:
-        name: name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])".
-        type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description, with
-            brackets for an array of Strings.
-        start: text of the start value; None without one.
-        description: description of the scalar, or of the whole array.
-        variability: as in the description, or its default there.
-        relative: whether it is a difference of values, to which the offset of a unit does not apply.
-        element: 0-based index in the array, row by row.
-        low, high: texts of the range; None without one.
-        exact: whether its value is the start value until the end of initialisation, at least.
-        items: numbers of the items of an enumeration by name; scalars of one type share it.
-    """
-
-    name: str
+    name: str  # name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])"
     causality: str
+    # "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description, with brackets
+    # for an array of Strings
     type: str
     unit: str | None
-    start: str | None
-    description: str
+    start: str | None  # text of the start value; None without one
+    description: str  # description of the scalar, or of the whole array
     reference: int
-    variability: str
-    relative: bool
-    element: int = 0
-    low: str | None = None
+    variability: str  # as in the description, or its default there
+    relative: bool  # whether it is a difference of values, to which the offset of a unit does not apply
+    element: int = 0  # 0-based index in the array, row by row
+    low: str | None = None  # low, high: texts of the range; None without one
     high: str | None = None
+    # numbers of the items of an enumeration by name; scalars of one type share it
     items: Mapping[str, int] = field(default_factory=dict, hash=False)
-    exact: bool = False
+    exact: bool = False  # whether its value is the start value until the end of initialisation, at least
 
     @property
     def start_value(self) -> float | bool | None:

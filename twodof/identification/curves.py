@@ -19,36 +19,24 @@ Table = Sequence[Sequence[str]]
 
 
 class Curve(NamedTuple):
-    """A stretch of a recording with N samples of n joints.
+    """A stretch of a recording with N samples of n joints."""
 
-    Attributes:
-        bag: index of the recording.
-        t: time since the first sample of the bag, s, N.
-        effort: recorded efforts at the times at which they act, N × n.
-        modelled: efforts of the model before and after the fit, along the measured motion; NaN where a joint may
-            rest, because its friction is not known there. 2 × N × n.
-        measured: measured positions of a held-out stretch, N × n; empty for a fitted one.
-        simulated: simulated positions before and after the fit, 2 × N × n; empty for a fitted stretch.
-    """
-
-    bag: int
-    t: Array
-    effort: Array
+    bag: int  # index of the recording
+    t: Array  # time since the first sample of the bag, s, N
+    effort: Array  # recorded efforts at the times at which they act, N × n
+    # efforts of the model before and after the fit, along the measured motion; NaN where a joint may rest, because its
+    # friction is not known there. 2 × N × n
     modelled: Array
-    measured: Array
-    simulated: Array
+    measured: Array  # measured positions of a held-out stretch, N × n; empty for a fitted one
+    simulated: Array  # simulated positions before and after the fit, 2 × N × n; empty for a fitted stretch
 
 
 class Comparison(NamedTuple):
-    """A model before and after a fit, compared with recordings.
+    """A model before and after a fit, compared with recordings."""
 
-    Attributes:
-        curves: fitted, then held-out stretches.
-        deviations: root mean square of simulated minus measured positions before and after the fit, rad or m, 2 × n;
-            empty if no stretch is held out.
-    """
-
-    curves: tuple[Curve, ...]
+    curves: tuple[Curve, ...]  # fitted, then held-out stretches
+    # root mean square of simulated minus measured positions before and after the fit, rad or m, 2 × n; empty if no
+    # stretch is held out
     deviations: tuple[tuple[float, ...], tuple[float, ...]]
 
 

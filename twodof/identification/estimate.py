@@ -34,38 +34,24 @@ NORMAL_95 = 1.959964
 
 
 class Estimate(NamedTuple):
-    """Result of an estimation of p coordinates and the delay.
+    """Result of an estimation of p coordinates and the delay."""
 
-    Attributes:
-        x: coordinates, p.
-        values: physical values.
-        covariance: covariance of the reported values, r × r, with the prior.
-        known: whether the data determine each reported value, r.
-        unseen: directions that the data do not determine, in scales, directions × p.
-        delay: delay of recorded efforts, s, and its standard deviation.
-        noise: standard deviation of the efforts' noise, N·m or N, n.
-        misfits: comparison of residuals for each joint.
-        suspects: errors that the residuals show, the most probable one first.
-        holds: for each joint that rests under more than its friction, the stretch with the largest excess.
-        fragile: change of each reported value, in its standard deviations, by constant errors of the efforts that these
-            data cannot show, r.
-        converged: False if the last solution still moved after its most steps; no value is known then.
-        interrupted: True if Ctrl-C ended the estimation.
-    """
-
-    x: Array
-    values: Values
-    covariance: Array
-    known: NDArray[np.bool_]
-    unseen: Array
-    delay: tuple[float, float]
-    noise: Array
-    misfits: tuple[Misfit, ...]
-    suspects: tuple[Suspect, ...]
+    x: Array  # coordinates, p
+    values: Values  # physical values
+    covariance: Array  # covariance of the reported values, r × r, with the prior
+    known: NDArray[np.bool_]  # whether the data determine each reported value, r
+    unseen: Array  # directions that the data do not determine, in scales, directions × p
+    delay: tuple[float, float]  # delay of recorded efforts, s, and its standard deviation
+    noise: Array  # standard deviation of the efforts' noise, N·m or N, n
+    misfits: tuple[Misfit, ...]  # comparison of residuals for each joint
+    suspects: tuple[Suspect, ...]  # errors that the residuals show, the most probable one first
+    # for each joint that rests under more than its friction, the stretch with the largest excess
     holds: tuple[Hold, ...]
+    # change of each reported value, in its standard deviations, by constant errors of the efforts that these data
+    # cannot show, r
     fragile: Array
-    converged: bool
-    interrupted: bool
+    converged: bool  # False if the last solution still moved after its most steps; no value is known then
+    interrupted: bool  # True if Ctrl-C ended the estimation
 
 
 class _Solution(NamedTuple):

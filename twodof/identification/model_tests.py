@@ -47,21 +47,13 @@ ERRORS = {
 
 
 class Misfit(NamedTuple):
-    """Comparison of the slow and the fast residuals of one joint.
+    """Comparison of the slow and the fast residuals of one joint."""
 
-    Attributes:
-        joint: index of the joint.
-        rms: root mean square of the slow residuals, N·m or N.
-        ratio: ratio of the variances of slow and fast residuals.
-        probability: probability of a ratio of this size or more with white noise.
-        part: ratio of the root mean squares of slow residuals and efforts.
-    """
-
-    joint: int
-    rms: float
-    ratio: float
-    probability: float
-    part: float
+    joint: int  # index of the joint
+    rms: float  # root mean square of the slow residuals, N·m or N
+    ratio: float  # ratio of the variances of slow and fast residuals
+    probability: float  # probability of a ratio of this size or more with white noise
+    part: float  # ratio of the root mean squares of slow residuals and efforts
 
     @property
     def bad(self) -> bool:
@@ -70,33 +62,20 @@ class Misfit(NamedTuple):
 
 
 class Suspect(NamedTuple):
-    """An error of the setup that the residuals show.
+    """An error of the setup that the residuals show."""
 
-    Attributes:
-        name: name of the parameter, as in patterns, or "clock".
-        size: most likely error: rad or m, or a part of efforts or speeds.
-        probability: probability of such residuals without the error.
-    """
-
-    name: str
-    size: float
-    probability: float
+    name: str  # name of the parameter, as in patterns, or "clock"
+    size: float  # most likely error: rad or m, or a part of efforts or speeds
+    probability: float  # probability of such residuals without the error
 
 
 class Hold(NamedTuple):
-    """A stretch in which a joint rests under more than its friction.
+    """A stretch in which a joint rests under more than its friction."""
 
-    Attributes:
-        joint: index of the joint.
-        t: begin of the stretch, s.
-        excess: effort beyond friction, N·m or N.
-        probability: probability of such an excess by noise.
-    """
-
-    joint: int
-    t: float
-    excess: float
-    probability: float
+    joint: int  # index of the joint
+    t: float  # begin of the stretch, s
+    excess: float  # effort beyond friction, N·m or N
+    probability: float  # probability of such an excess by noise
 
 
 def suspects_of(

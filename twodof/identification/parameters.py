@@ -57,33 +57,20 @@ SEEN = 0.5
 
 @dataclass
 class Values:
-    """Physical values of all parameters of a robot with n joints and k links that move and have mass.
+    """Physical values of all parameters of a robot with n joints and k links that move and have mass."""
 
-    Attributes:
-        friction, damping, armature: values of the joints, n each.
-        offset: true minus measured position, rad or m, n.
-        gain: ratio of true to recorded effort, n.
-        bias: constant part of the effort, N·m or N, n.
-        mass: masses of links, kg, k.
-        com: centres of mass in the links' frames, m, k × 3.
-        second: second moments of mass about the centre, in the links' axes, kg·m², k × 3 × 3.
-        payload: point mass in the task frame, kg, 1.
-        payload_com: position of the payload in the task frame, m, 3.
-        gravity: m/s², root frame, 3.
-    """
-
-    friction: Numbers
+    friction: Numbers  # friction, damping, armature: values of the joints, n each
     damping: Numbers
     armature: Numbers
-    offset: Numbers
-    gain: Numbers
-    bias: Numbers
-    mass: Numbers
-    com: Numbers
-    second: Numbers
-    payload: Numbers
-    payload_com: Numbers
-    gravity: Numbers
+    offset: Numbers  # true minus measured position, rad or m, n
+    gain: Numbers  # ratio of true to recorded effort, n
+    bias: Numbers  # constant part of the effort, N·m or N, n
+    mass: Numbers  # masses of links, kg, k
+    com: Numbers  # centres of mass in the links' frames, m, k × 3
+    second: Numbers  # second moments of mass about the centre, in the links' axes, kg·m², k × 3 × 3
+    payload: Numbers  # point mass in the task frame, kg, 1
+    payload_com: Numbers  # position of the payload in the task frame, m, 3
+    gravity: Numbers  # m/s², root frame, 3
 
     def copy(self, kind: type) -> Values:
         """Return a copy with numbers of a type, float or complex."""
@@ -91,16 +78,12 @@ class Values:
 
 
 class Dynamics(NamedTuple):
-    """Parameters of inverse dynamics, or their derivatives with respect to the coordinates along a last axis.
+    """Parameters of inverse dynamics, or their derivatives with respect to the coordinates along a last axis."""
 
-    Attributes:
-        inertial: ten dynamic parameters of each body about its joint's frame, in Pinocchio's order, 10·bodies;
-            bodies are what joints move, with all links that are rigidly joined.
-        friction, damping, armature, offset, gain, bias, gravity: as in ``Values``.
-    """
-
+    # ten dynamic parameters of each body about its joint's frame, in Pinocchio's order, 10·bodies; bodies are what
+    # joints move, with all links that are rigidly joined
     inertial: Numbers
-    friction: Numbers
+    friction: Numbers  # friction, damping, armature, offset, gain, bias, gravity: as in ``Values``
     damping: Numbers
     armature: Numbers
     offset: Numbers

@@ -21,15 +21,10 @@ RTOL, ATOL = 1e-5, 1e-7
 
 
 class Prediction(NamedTuple):
-    """A stretch that was simulated in windows.
+    """A stretch that was simulated in windows."""
 
-    Attributes:
-        q: simulated positions as the encoders would measure them, N × n; NaN where the simulation failed.
-        begins: indices of the samples at which windows begin.
-    """
-
-    q: Array
-    begins: tuple[int, ...]
+    q: Array  # simulated positions as the encoders would measure them, N × n; NaN where the simulation failed
+    begins: tuple[int, ...]  # indices of the samples at which windows begin
 
 
 def plant_of(robot: Robot, values: Dynamics, step: float) -> Plant:

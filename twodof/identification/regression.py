@@ -41,37 +41,24 @@ filter, whose size is half the square of its time constant, s²."""
 
 
 class Rows(NamedTuple):
-    """Rows of one joint.
+    """Rows of one joint."""
 
-    Attributes:
-        joint: index of the joint.
-        varying: indices of the m inertial parameters that vary, of 10·bodies; the others have the URDF's values.
-        Y: regressor of the varying inertial parameters without gravity, and the effort of the others, K × (m + 1).
-        G: the same per m/s² of gravity along x, y and z of the root, 3 × K × (m + 1).
-        sign, v, a, one: regressors of friction, damping, armature and bias, K each.
-        tau, tau_rate: recorded effort and its derivative, K.
-        offsets: derivative of the inverse dynamics with respect to positions, K × n.
-        unmodelled: efforts of each of UNMODELLED of size 1, K × 3.
-        bin: index of each row's frequency bin, K.
-        power: mean square of the recorded effort where each row weighs it, K.
-        about: offsets, n, and delay of the efforts, s, at which the rows were linearised.
-    """
-
-    joint: int
+    joint: int  # index of the joint
+    # indices of the m inertial parameters that vary, of 10·bodies; the others have the URDF's values
     varying: NDArray[np.int64]
-    Y: Array
-    G: Array
-    sign: Array
+    Y: Array  # regressor of the varying inertial parameters without gravity, and the effort of the others, K × (m + 1)
+    G: Array  # the same per m/s² of gravity along x, y and z of the root, 3 × K × (m + 1)
+    sign: Array  # sign, v, a, one: regressors of friction, damping, armature and bias, K each
     v: Array
     a: Array
     one: Array
-    tau: Array
+    tau: Array  # tau, tau_rate: recorded effort and its derivative, K
     tau_rate: Array
-    offsets: Array
-    unmodelled: Array
-    bin: NDArray[np.int64]
-    power: Array
-    about: tuple[Array, float]
+    offsets: Array  # derivative of the inverse dynamics with respect to positions, K × n
+    unmodelled: Array  # efforts of each of UNMODELLED of size 1, K × 3
+    bin: NDArray[np.int64]  # index of each row's frequency bin, K
+    power: Array  # mean square of the recorded effort where each row weighs it, K
+    about: tuple[Array, float]  # offsets, n, and delay of the efforts, s, at which the rows were linearised
 
 
 def regressors(robot: Robot, stretch: Stretch, values: Dynamics, varying: NDArray[np.int64]) -> tuple[Array, Array]:

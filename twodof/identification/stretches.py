@@ -55,27 +55,17 @@ standard deviations of the effort. A reversal of friction alone gives at most 2.
 
 
 class Stretch(NamedTuple):
-    """Samples without a gap on an even grid, n joints in the robot's order.
+    """Samples without a gap on an even grid, n joints in the robot's order."""
 
-    Attributes:
-        bag: index of the recording.
-        t: time since the first sample of the bag, s, N.
-        measured: recorded positions, N × n.
-        q, v, a: smooth positions and their derivatives, N × n.
-        tau: recorded efforts, N × n.
-        moving: whether a joint certainly moves, N × n.
-        band: highest frequency of the fit of each joint, Hz, n.
-    """
-
-    bag: int
-    t: Array
-    measured: Array
-    q: Array
+    bag: int  # index of the recording
+    t: Array  # time since the first sample of the bag, s, N
+    measured: Array  # recorded positions, N × n
+    q: Array  # q, v, a: smooth positions and their derivatives, N × n
     v: Array
     a: Array
-    tau: Array
-    moving: NDArray[np.bool_]
-    band: Array
+    tau: Array  # recorded efforts, N × n
+    moving: NDArray[np.bool_]  # whether a joint certainly moves, N × n
+    band: Array  # highest frequency of the fit of each joint, Hz, n
 
     @property
     def step(self) -> float:

@@ -52,19 +52,14 @@ def names_page(path: Path) -> bool:
 
 
 class Arm(NamedTuple):
-    """Contents of a robot's page.
+    """Contents of a robot's page."""
 
-    Attributes:
-        facts: facts of the FMU by name: name, robot, joints, frame, axes and control as in ``Fmu``; step, s; variables,
-            with each element of a vector: name, index, causality, type, unit, start and description; and remarks,
-            which are warnings.
-        urdf: text of resources/robot.urdf.
-        shapes: shapes of the links.
-    """
-
+    # facts of the FMU by name: name, robot, joints, frame, axes and control as in ``Fmu``; step, s; variables, with
+    # each element of a vector: name, index, causality, type, unit, start and description; and remarks, which are
+    # warnings
     facts: JsonObject
-    urdf: str
-    shapes: Sequence[Shape]
+    urdf: str  # text of resources/robot.urdf
+    shapes: Sequence[Shape]  # shapes of the links
 
     @property
     def title(self) -> str:

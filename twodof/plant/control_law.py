@@ -10,17 +10,13 @@ from .robot import Robot
 class ControlledPlant:
     """The parts of a plant that control laws read.
 
-    Attributes:
-        robot, control: the robot, and the name of its control law (a key of ``CONTROLS``).
-        known: the control law's model of the robot.
-
     Each group of variables is an attribute of the same name, in SI units: a list of floats for a vector, and a float,
     int or bool for a scalar. Task vectors are in the root frame.
     """
 
-    robot: Robot
+    robot: Robot  # robot, control: the robot, and the name of its control law (a key of ``CONTROLS``)
     control: str
-    known: Mechanism
+    known: Mechanism  # the control law's model of the robot
 
     if TYPE_CHECKING:
 

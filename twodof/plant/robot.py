@@ -19,41 +19,28 @@ from .urdf import INERTIA, NUMERIC_TAGS, UNBOUNDED, Joint, RobotError, Urdf, att
 
 @dataclass(frozen=True)
 class Robot:
-    """A fixed-base robot with n independent joints, and its task frame.
-
-    Attributes:
-        model: Pinocchio model of all joints that move, one coordinate each; its gravity is not
-            used (see ``Mechanism``).
-        coupling, offset: positions of the model's joints are ``coupling @ q + offset``; coupling is None, and the
-            positions are q, if no joint mimics another.
-        joints: names of the n joints in the model's order.
-        prismatic: for each joint, True if its coordinate is a length (m), False for an angle (rad).
-        q_min, q_max: position limits, rad or m, including limits of joints that mimic it; ∓UNBOUNDED without one.
-        effort: effort limits, N·m or N; infinite if the URDF has 0 or none.
-        damping: viscous joint damping D, N·m·s/rad or N·s/m, including that of joints that mimic it.
-        friction: Coulomb friction, N·m or N, including that of joints that mimic it.
-        frame: name of the task frame, and its Pinocchio index ``frame_id``.
-        axes: task axes, a subset of "xyz" in the root frame, e.g. "xy"; m = len(axes).
-        root: name of the URDF's root link, the frame in which positions are expressed.
-        warnings: URDF elements without effect, one line each.
-    """
+    """A fixed-base robot with n independent joints, and its task frame."""
 
     name: str
+    # Pinocchio model of all joints that move, one coordinate each; its gravity is not used (see ``Mechanism``)
     model: pin.Model
+    # coupling, offset: positions of the model's joints are ``coupling @ q + offset``; coupling is None, and the
+    # positions are q, if no joint mimics another
     coupling: NDArray[np.float64] | None
     offset: NDArray[np.float64]
-    joints: tuple[str, ...]
-    prismatic: tuple[bool, ...]
+    joints: tuple[str, ...]  # names of the n joints in the model's order
+    prismatic: tuple[bool, ...]  # for each joint, True if its coordinate is a length (m), False for an angle (rad)
+    # q_min, q_max: position limits, rad or m, including limits of joints that mimic it; ∓UNBOUNDED without one
     q_min: tuple[float, ...]
     q_max: tuple[float, ...]
-    effort: tuple[float, ...]
-    damping: tuple[float, ...]
-    friction: tuple[float, ...]
-    frame: str
+    effort: tuple[float, ...]  # effort limits, N·m or N; infinite if the URDF has 0 or none
+    damping: tuple[float, ...]  # viscous joint damping D, N·m·s/rad or N·s/m, including that of joints that mimic it
+    friction: tuple[float, ...]  # Coulomb friction, N·m or N, including that of joints that mimic it
+    frame: str  # name of the task frame, and its Pinocchio index ``frame_id``
     frame_id: int
-    axes: str
-    root: str
-    warnings: tuple[str, ...]
+    axes: str  # task axes, a subset of "xyz" in the root frame, e.g. "xy"; m = len(axes)
+    root: str  # name of the URDF's root link, the frame in which positions are expressed
+    warnings: tuple[str, ...]  # URDF elements without effect, one line each
 
     def moves_frame(self) -> tuple[bool, ...]:
         """Return the mask of the joints between the root and the task frame."""

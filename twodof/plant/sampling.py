@@ -30,23 +30,16 @@ WHOLE = 2.0**53
 
 @dataclass
 class Sampling:
-    """Discrete state of a sampled controller of n joints.
+    """Discrete state of a sampled controller of n joints."""
 
-    Attributes:
-        start: t_0, s.
-        count: number of efforts that were commanded and do not act yet.
-        q_meas, v_meas: the latest sample, n values each, rad or m, rad/s or m/s.
-        effort: the effort that acts now, n values, N·m or N.
-        pending: efforts that do not act yet, the oldest first; MOST_PERIODS + 1 lists, of which ``count`` are used.
-    """
-
-    start: float
+    start: float  # t_0, s
     time: float
     k: int
-    count: int
-    q_meas: list[float]
+    count: int  # number of efforts that were commanded and do not act yet
+    q_meas: list[float]  # q_meas, v_meas: the latest sample, n values each, rad or m, rad/s or m/s
     v_meas: list[float]
-    effort: list[float]
+    effort: list[float]  # the effort that acts now, n values, N·m or N
+    # efforts that do not act yet, the oldest first; MOST_PERIODS + 1 lists, of which ``count`` are used
     pending: list[list[float]]
 
     @classmethod

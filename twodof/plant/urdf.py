@@ -38,35 +38,23 @@ class RobotError(ValueError):
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of a URDF.
-
-    Attributes:
-        type: "fixed", "revolute", "continuous" or "prismatic".
-        xyz, rpy: pose of its frame in the parent's frame at q = 0, m, and rad about the fixed axes x, y, z.
-        axis: unit vector in the joint's frame.
-        low, high: position limits, rad or m; ∓UNBOUNDED without limits.
-        effort, velocity: limits, N·m or N, rad/s or m/s; infinite if the URDF has 0 or none.
-        damping, friction: viscous, N·m·s/rad or N·s/m, and Coulomb friction, N·m or N.
-        leader: the independent joint that it follows: q = ratio·q_leader + offset; its own name if it is
-            independent.
-        ratio, offset: constants of this equation.
-    """
+    """A joint of a URDF."""
 
     name: str
-    type: str
+    type: str  # "fixed", "revolute", "continuous" or "prismatic"
     parent: str
     child: str
-    xyz: Vector
+    xyz: Vector  # xyz, rpy: pose of its frame in the parent's frame at q = 0, m, and rad about the fixed axes x, y, z
     rpy: Vector
-    axis: Vector
-    low: float
+    axis: Vector  # unit vector in the joint's frame
+    low: float  # low, high: position limits, rad or m; ∓UNBOUNDED without limits
     high: float
-    effort: float
+    effort: float  # effort, velocity: limits, N·m or N, rad/s or m/s; infinite if the URDF has 0 or none
     velocity: float
-    damping: float
+    damping: float  # damping, friction: viscous, N·m·s/rad or N·s/m, and Coulomb friction, N·m or N
     friction: float
-    leader: str
-    ratio: float = 1.0
+    leader: str  # the independent joint that it follows: q = ratio·q_leader + offset; its own name if it is independent
+    ratio: float = 1.0  # ratio, offset: constants of this equation
     offset: float = 0.0
 
     @property
@@ -82,22 +70,14 @@ class Joint:
 
 @dataclass(frozen=True)
 class Urdf:
-    """A robot as described by its URDF.
-
-    Attributes:
-        root: the link without a parent.
-        links: link names, in the order of the file.
-        joints: joints by name, in the order of the file.
-        tree: the XML, for all other facts.
-        warnings: elements without effect, one line each.
-    """
+    """A robot as described by its URDF."""
 
     name: str
-    root: str
-    links: tuple[str, ...]
-    joints: dict[str, Joint]
-    tree: ET.Element
-    warnings: tuple[str, ...]
+    root: str  # the link without a parent
+    links: tuple[str, ...]  # link names, in the order of the file
+    joints: dict[str, Joint]  # joints by name, in the order of the file
+    tree: ET.Element  # the XML, for all other facts
+    warnings: tuple[str, ...]  # elements without effect, one line each
 
     def chain(self, link: str) -> list[Joint]:
         """Return the joints from the root to a link."""

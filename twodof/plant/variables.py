@@ -47,30 +47,21 @@ RANGES = {
 
 @dataclass(frozen=True)
 class Variable:
-    """A scalar variable of the FMU.
+    """A scalar variable of the FMU."""
 
-    Attributes:
-        group: the vector's name and the plant's attribute, e.g. "x_des"; ``index`` its 0-based
-            element, None for a scalar. "der_q" is the derivative of "q".
-        causality: "input", "output", "local" (the derivatives of the states q and v) or
-            "parameter" (all parameters are fixed).
-        unit: FMI unit name, or "".
-        start: start value; None for computed variables.
-        called: name of the vector in the FMU if it differs from the group; else "".
-        shown: whether the FMU declares it; otherwise only the engine uses it.
-        columns: number of columns of a matrix, whose elements ``index`` counts row by row; 0 for other variables.
-        known: the URDF's value of a link's mass, centre or inertia, for the controller's model; else None.
-    """
-
+    # the vector's name and the plant's attribute, e.g. "x_des"; ``index`` its 0-based element, None for a scalar.
+    # "der_q" is the derivative of "q"
     group: str
     index: int | None
+    # "input", "output", "local" (the derivatives of the states q and v) or "parameter" (all parameters are fixed)
     causality: str
-    unit: str
-    start: Value | None
+    unit: str  # FMI unit name, or ""
+    start: Value | None  # start value; None for computed variables
     description: str
-    called: str = ""
-    shown: bool = True
-    columns: int = 0
+    called: str = ""  # name of the vector in the FMU if it differs from the group; else ""
+    shown: bool = True  # whether the FMU declares it; otherwise only the engine uses it
+    columns: int = 0  # number of columns of a matrix, whose elements ``index`` counts row by row; 0 for other variables
+    # the URDF's value of a link's mass, centre or inertia, for the controller's model; else None
     known: float | None = None
 
     @property
@@ -106,23 +97,14 @@ class Variable:
 
 @dataclass(frozen=True)
 class Control:
-    """A control law: the source of joint accelerations or efforts.
+    """A control law: the source of joint accelerations or efforts."""
 
-    Attributes:
-        title: description in words, with "{frame}" for the frame.
-        inputs: groups of inputs, in the table's order; τ depends on them directly.
-        parameters: groups of parameters.
-        commands: result of the law, "acceleration" (q̈_cmd, then inverse dynamics) or "effort" (τ).
-        rigid_stops: default of the parameter ``rigid_stops``.
-        outputs: groups of outputs that only this law has.
-    """
-
-    title: str
-    inputs: tuple[str, ...]
-    parameters: tuple[str, ...]
-    commands: str
-    rigid_stops: bool
-    outputs: tuple[str, ...] = ()
+    title: str  # description in words, with "{frame}" for the frame
+    inputs: tuple[str, ...]  # groups of inputs, in the table's order; τ depends on them directly
+    parameters: tuple[str, ...]  # groups of parameters
+    commands: str  # result of the law, "acceleration" (q̈_cmd, then inverse dynamics) or "effort" (τ)
+    rigid_stops: bool  # default of the parameter ``rigid_stops``
+    outputs: tuple[str, ...] = ()  # groups of outputs that only this law has
 
 
 CONTROLS = {

@@ -75,22 +75,15 @@ class Plot(Figure):
 
 
 class Drawing(NamedTuple):
-    """Content of a figure or page.
-
-    Attributes:
-        name: default name of the file.
-        draw: function that draws into an empty figure, and sets the figure's size.
-        columns: columns of the table below the figure on a page.
-        body: function that returns the HTML that replaces the figure on a page; None: show the figure.
-        above: function that returns the HTML above the figure on a page.
-    """
+    """Content of a figure or page."""
 
     title: str
-    name: str
-    draw: Callable[[Figure], None]
-    columns: Sequence[Mapping[str, str]]
+    name: str  # default name of the file
+    draw: Callable[[Figure], None]  # function that draws into an empty figure, and sets the figure's size
+    columns: Sequence[Mapping[str, str]]  # columns of the table below the figure on a page
+    # function that returns the HTML that replaces the figure on a page; None: show the figure
     body: Callable[[], str] | None = None
-    above: Callable[[], str] | None = None
+    above: Callable[[], str] | None = None  # function that returns the HTML above the figure on a page
 
 
 def drawn(drawing: Drawing) -> Figure:

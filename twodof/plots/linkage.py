@@ -27,38 +27,25 @@ class Reach:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the robot's links; points in the root frame, m.
-
-    Attributes:
-        frame, root: the end effector's link, and the link in which points are expressed.
-        path: path of the end effector, N × 3.
-        start, end: points of the arm at the first and the last sample: root, joints and end effector, × 3.
-        reach: reach circle; None unless the arm moves in a plane of two of the root's axes.
-    """
+    """Motion of the robot's links; points in the root frame, m."""
 
     robot: str
-    frame: str
+    frame: str  # frame, root: the end effector's link, and the link in which points are expressed
     root: str
-    path: Array
-    start: Array
+    path: Array  # path of the end effector, N × 3
+    start: Array  # start, end: points of the arm at the first and the last sample: root, joints and end effector, × 3
     end: Array
-    reach: Reach | None
+    reach: Reach | None  # reach circle; None unless the arm moves in a plane of two of the root's axes
 
 
 class Linkage(NamedTuple):
-    """Geometry, limits and damping of a robot for pictures, which may have invalid masses.
-
-    Attributes:
-        moving: independent joints, and joints that mimic them if the bag has these.
-        frame: the end effector's link.
-        axes: task axes, letters of "xyz".
-    """
+    """Geometry, limits and damping of a robot for pictures, which may have invalid masses."""
 
     urdf: Urdf
     kinematics: Kinematics
-    moving: tuple[Joint, ...]
-    frame: str
-    axes: str
+    moving: tuple[Joint, ...]  # independent joints, and joints that mimic them if the bag has these
+    frame: str  # the end effector's link
+    axes: str  # task axes, letters of "xyz"
 
     @property
     def chain(self) -> list[Joint]:

@@ -32,24 +32,16 @@ LineStyles = Mapping[tuple[int, str], LineStyle]
 
 
 class Panel(NamedTuple):
-    """One quantity over time.
+    """One quantity over time."""
 
-    Attributes:
-        kind: quantity, one of KINDS.
-        joint: name of the joint; "" for the error.
-        unit: unit; "rad or m" if the robot is unknown.
-        strokes: curves of each track, which have a kind; behind them targets, limits, and the closed form of the error
-            if it is in the range.
-        note: limits in words, or the note that an error is below the range.
-        range: range of the axis, which contains the curves and nearby limits.
-    """
-
-    kind: str
-    joint: str
-    unit: str
+    kind: str  # quantity, one of KINDS
+    joint: str  # name of the joint; "" for the error
+    unit: str  # unit; "rad or m" if the robot is unknown
+    # curves of each track, which have a kind; behind them targets, limits, and the closed form of the error if it is in
+    # the range
     strokes: tuple[Stroke, ...]
-    note: str
-    range: tuple[float, float]
+    note: str  # limits in words, or the note that an error is below the range
+    range: tuple[float, float]  # range of the axis, which contains the curves and nearby limits
 
 
 def title(tracks: Sequence[Track]) -> str:

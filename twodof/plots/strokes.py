@@ -34,32 +34,21 @@ class LineStyle(NamedTuple):
 
 
 class Stroke(NamedTuple):
-    """A line in a picture, or markers.
-
-    Attributes:
-        track: index of the track, or None.
-        x, y: horizontal and vertical coordinates; one is empty for lines across the whole picture at the other's
-            values.
-        width: line width in points; 0: no line.
-        mark: marker at all points: "o" (not at the last point), "+", "v", "x", "." or "".
-        depth: drawing order; higher strokes cover lower ones.
-        joint: joint of the track; "": the stroke belongs to the whole track.
-        kind: quantity of the values, for which a page shows numbers; "": none.
-        framed: whether the limits of the picture must include it.
-    """
+    """A line in a picture, or markers."""
 
     label: str
-    track: int | None
+    track: int | None  # index of the track, or None
+    # x, y: horizontal and vertical coordinates; one is empty for lines across the whole picture at the other's values
     x: Array
     y: Array
     colour: str
-    width: float
+    width: float  # line width in points; 0: no line
     dashes: tuple[float, ...] = ()
-    mark: str = ""
-    depth: float = 4.0
-    joint: str = ""
-    kind: str = ""
-    framed: bool = True
+    mark: str = ""  # marker at all points: "o" (not at the last point), "+", "v", "x", "." or ""
+    depth: float = 4.0  # drawing order; higher strokes cover lower ones
+    joint: str = ""  # joint of the track; "": the stroke belongs to the whole track
+    kind: str = ""  # quantity of the values, for which a page shows numbers; "": none
+    framed: bool = True  # whether the limits of the picture must include it
 
     @property
     def is_limit(self) -> bool:

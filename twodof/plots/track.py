@@ -28,27 +28,20 @@ MOST_HELD = 20_000  # changes of inputs in a closed form; each takes 0.1 ms
 
 @dataclass(frozen=True)
 class JointTrack:
-    """One joint's coordinate over time.
-
-    Attributes:
-        unit: "rad" or "m"; "" if the robot is unknown.
-        low, high: position limits of the run, or else of the URDF; None if unknown.
-        effort: limit of the URDF, N·m or N; None if unknown.
-        q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample, N
-            values each; unknown ones are empty.
-        has_friction: whether it has friction, and the velocities are true ones, which are 0 while friction holds it.
-    """
+    """One joint's coordinate over time."""
 
     name: str
-    unit: str
-    low: float | None
+    unit: str  # "rad" or "m"; "" if the robot is unknown
+    low: float | None  # low, high: position limits of the run, or else of the URDF; None if unknown
     high: float | None
-    effort: float | None
+    effort: float | None  # limit of the URDF, N·m or N; None if unknown
+    # q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample, N values each; unknown
+    # ones are empty
     q: Array
     v: Array
     tau: Array
     target: Array
-    has_friction: bool
+    has_friction: bool  # whether it has friction, and the velocities are true ones, which are 0 while friction holds it
 
     @property
     def stuck(self) -> Array:
@@ -71,43 +64,30 @@ class JointTrack:
 
 @dataclass(frozen=True)
 class Task:
-    """Target and error of the controller; m task axes.
-
-    Attributes:
-        target: target position in effect up to each sample, N × m; NaN before the first target.
-        error: distance from the target, m, N values; NaN before the first target.
-        closed_form: error of the closed form; None if the gains are unknown, or if the robot has fewer joints
-            than the task has coordinates.
-        off: distance of the position from the closed form, m, N values; None without a closed form.
-        disturbances: effects that the closed form neglects.
-    """
+    """Target and error of the controller; m task axes."""
 
     axes: str
-    target: Array
-    error: Array
+    target: Array  # target position in effect up to each sample, N × m; NaN before the first target
+    error: Array  # distance from the target, m, N values; NaN before the first target
+    # error of the closed form; None if the gains are unknown, or if the robot has fewer joints than the task has
+    # coordinates
     closed_form: Array | None
-    off: Array | None
-    disturbances: tuple[str, ...]
+    off: Array | None  # distance of the position from the closed form, m, N values; None without a closed form
+    disturbances: tuple[str, ...]  # effects that the closed form neglects
 
 
 @dataclass(frozen=True)
 class Track:
-    """All data of a bag for drawing.
-
-    Attributes:
-        settings: settings of the run as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
-        t: time since the first sample, s, N values.
-        motion, task: motion of the links, and task; None if the robot is unknown, the task also without a target.
-        linkage: the robot; None if unknown.
-    """
+    """All data of a bag for drawing."""
 
     recording: Recording
-    settings: Mapping[str, str]
-    t: Array
+    settings: Mapping[str, str]  # settings of the run as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown
+    t: Array  # time since the first sample, s, N values
     joints: tuple[JointTrack, ...]
+    # motion, task: motion of the links, and task; None if the robot is unknown, the task also without a target
     motion: Motion | None
     task: Task | None
-    linkage: Linkage | None = None
+    linkage: Linkage | None = None  # the robot; None if unknown
 
     @cached_property
     def verdict(self) -> Verdict:

@@ -20,16 +20,11 @@ SIDE = 2.8  # inches, width of the workspace
 
 
 class View(NamedTuple):
-    """A projection along one of the root's axes.
+    """A projection along one of the root's axes."""
 
-    Attributes:
-        axes: letters of the horizontal and the vertical axis.
-        across, up: limits of the axes, with space at the edges, m.
-    """
-
-    axes: str
+    axes: str  # letters of the horizontal and the vertical axis
     strokes: tuple[Stroke, ...]
-    across: tuple[float, float]
+    across: tuple[float, float]  # across, up: limits of the axes, with space at the edges, m
     up: tuple[float, float]
 
 

@@ -43,16 +43,11 @@ class CommandError(Exception):
 
 
 class Command(NamedTuple):
-    """The inputs that a message commands.
+    """The inputs that a message commands."""
 
-    Attributes:
-        stamp: time stamp, ns since the epoch; 0 without one.
-        unknown_joints: names of joints that the robot does not have.
-    """
-
-    stamp: int
+    stamp: int  # time stamp, ns since the epoch; 0 without one
     inputs: Inputs
-    unknown_joints: tuple[str, ...] = ()
+    unknown_joints: tuple[str, ...] = ()  # names of joints that the robot does not have
 
 
 def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:

@@ -43,21 +43,13 @@ NODES, WEIGHTS = leggauss(3)  # exact up to degree 5
 
 
 class Trajectory(NamedTuple):
-    """A trajectory of joints.
+    """A trajectory of joints."""
 
-    Attributes:
-        start: start time, s.
-        joints: indices of the n joints.
-        times: times of the points, s, ascending; some may be before the start.
-        points: position, and if given velocity and acceleration, k × n each.
-        unknown_joints: names of joints that the robot does not have.
-    """
-
-    start: float
-    joints: list[int]
-    times: list[float]
-    points: list[Array]
-    unknown_joints: tuple[str, ...] = ()
+    start: float  # start time, s
+    joints: list[int]  # indices of the n joints
+    times: list[float]  # times of the points, s, ascending; some may be before the start
+    points: list[Array]  # position, and if given velocity and acceleration, k × n each
+    unknown_joints: tuple[str, ...] = ()  # names of joints that the robot does not have
 
 
 def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int) -> Trajectory:

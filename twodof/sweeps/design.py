@@ -20,19 +20,12 @@ OWN_COLUMNS = (*METRICS, "run", "end_time", "outcome", "message", "cost")
 
 @dataclass(frozen=True)
 class Design:
-    """Runs 0 … N − 1: every combination of the grids, each with the same random draws.
+    """Runs 0 … N − 1: every combination of the grids, each with the same random draws."""
 
-    Attributes:
-        grids: values by variable; the last one changes fastest.
-        ranges: low and high by variable, drawn uniformly.
-        draws: number of draws of all ranges; 1 without ranges.
-        seed: seed of the draws.
-    """
-
-    grids: Mapping[str, tuple[float, ...]]
-    ranges: Mapping[str, tuple[float, float]]
-    draws: int = 1
-    seed: int = 0
+    grids: Mapping[str, tuple[float, ...]]  # values by variable; the last one changes fastest
+    ranges: Mapping[str, tuple[float, float]]  # low and high by variable, drawn uniformly
+    draws: int = 1  # number of draws of all ranges; 1 without ranges
+    seed: int = 0  # seed of the draws
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -38,20 +38,13 @@ LOOK = 0.2  # s between two checks of ``stop``
 
 @dataclass(frozen=True)
 class Job:
-    """Common settings of all runs of a sweep.
+    """Common settings of all runs of a sweep."""
 
-    Attributes:
-        content: bytes of the FMU's file.
-        file: name of the FMU's file.
-        options: options of ``experiment``: stop_time, step, settings.
-        bags: folder for a bag of each run; None: no bags.
-    """
-
-    content: bytes
-    file: str
+    content: bytes  # bytes of the FMU's file
+    file: str  # name of the FMU's file
     names: tuple[str, ...]
-    options: ExperimentOptions
-    bags: Path | None
+    options: ExperimentOptions  # options of ``experiment``: stop_time, step, settings
+    bags: Path | None  # folder for a bag of each run; None: no bags
 
 
 class Runner:
