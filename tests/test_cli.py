@@ -323,6 +323,7 @@ def test_the_shell_completes_verbs_options_variables_frames_and_joints(native_pa
         f"twodof run {native_path} --set K": ["Kp=", "Kd=", "Kn="],
         f"twodof linearise {native_path} --at q_st": ["q_start="],
         f"twodof sweep {native_path} --grid Kp": ["Kp="],
+        "twodof build --robot panda": ["panda", "panda_collision"],
         f"twodof build {urdf} --frame En": ["EndEffector"],
         f"twodof build {urdf} --lock jo": ["joint1", "joint2"],
         f"twodof build {hostile} --lock jo": ["joint2"],

@@ -19,6 +19,7 @@ from .options import (
     output_file,
     parse_locks,
     parse_settings,
+    robots,
 )
 from .printing import busy, print_next, print_table, quote, say, written
 
@@ -28,7 +29,7 @@ def add(build: Parser) -> None:
     add_output(build, "FILE.fmu", "output file (<name>.fmu); - is the standard output", output_file)
     option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the default arm)")
     text = "robot of an installed package, such as panda; --list-robots prints them"
-    option("--robot", dest="stock", type=not_empty, metavar="NAME", help=text)
+    option("--robot", dest="stock", type=not_empty, metavar="NAME", help=text, completer=robots)
     flag("--list-robots", help="print the names of these robots")
     option("--urdf", type=Path, metavar="FILE", help="same as the argument URDF")
     option("--mesh-dir", type=Path, metavar="FOLDER", help="folder of the URDF's packages or meshes")

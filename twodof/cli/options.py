@@ -54,6 +54,13 @@ def _file(options: argparse.Namespace) -> Path | None:
     return Path(first[0] if isinstance(first, list) else first) if first else None
 
 
+def robots(**_: object) -> list[str]:
+    """Complete a robot of an installed package."""
+    from ..export.stock_robots import stock_robots
+
+    return [*stock_robots()]
+
+
 def variables(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     """Complete an FMU's inputs and parameters."""
     path = _file(parsed_args)
