@@ -41,8 +41,7 @@ with Connection(int(sys.argv[1])) as pipe, suppress(OSError):  # the parent has 
 DESCRIPTORS = 64  # open at a time
 NO_NEW_PRIVILEGES = 38  # option of prctl
 LANDLOCK_CREATE, LANDLOCK_ADD, LANDLOCK_RESTRICT = 444, 445, 446  # on all architectures
-FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
-"""Number of rights to files that a version of Landlock handles."""
+FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}  # number of rights to files that a version of Landlock handles
 READ, EXECUTE = 1 << 2 | 1 << 3, 1 << 0  # files and folders; programs
 SECCOMP, FILTER, ALL_THREADS = 317, 1, 1
 X86_64 = 0xC000003E

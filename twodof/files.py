@@ -25,8 +25,7 @@ from .errors import TwoDofError
 
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # compression methods that FMI allows
 MAX_LINKS_FOLLOWED = 40  # the kernel's limit
-TEMPORARY = ".twodof."
-"""Prefix of temporary folders, whose process holds their lock or has died."""
+TEMPORARY = ".twodof."  # prefix of temporary folders, whose process holds their lock or has died
 MADE_HERE = re.compile(r"\.twodof\.tmp\w{8}")  # names that mkdtemp makes
 FEW_BYTES = 1_000_000  # free bytes of a disk that is almost full
 LOCK_TIMEOUT = 5.0  # s of waiting for a lock

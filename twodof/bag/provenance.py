@@ -21,8 +21,7 @@ from .records import DamageError
 
 FILE = "run.json"
 FORMAT = 1
-KEY = "twodof"
-"""Key of the provenance in a bag's own metadata."""
+KEY = "twodof"  # key of the provenance in a bag's own metadata
 MAX_YAML = 256 * 1024  # bytes of changes in metadata.yaml: YAML libraries take seconds per MiB
 KNOWN_UNTIL: Final = "inputs_known_until"
 """Key of the time, s, after which changes of inputs are missing because the file is full."""

@@ -45,8 +45,7 @@ SAMPLES = (JOINT_STATES, TRUE_STATES, END_EFFECTOR)  # topics of a robot's motio
 COMMANDS = "/joint_commands"
 FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs that trajectories set
 Read = TypeVar("Read", Command, Trajectory)
-Stored = list[tuple[int, str, bytes]]
-"""Messages: recording time (ns since the epoch), type and content."""
+Stored = list[tuple[int, str, bytes]]  # messages: recording time (ns since the epoch), type and content
 
 
 def read_commands(

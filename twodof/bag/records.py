@@ -21,8 +21,7 @@ from ..ros.cdr import Rows
 RECORD = 2000  # bytes of budget for a record; a packed message takes at least 3 bytes of a file
 TEXT = 100  # bytes of budget for each byte of a topic's texts, which stay in memory
 
-Stamps = NDArray[np.int64]
-"""N times, ns since the epoch."""
+Stamps = NDArray[np.int64]  # N times, ns since the epoch
 
 
 class Channel(NamedTuple):

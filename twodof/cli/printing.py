@@ -24,17 +24,12 @@ OPTIONS = {
     "settings": "--set",
 }
 """Options whose names differ from the library's argument."""
-NEEDS = {"plot": "matplotlib", "view": "websockets"}
-"""Modules of the extra 'view' that verbs need."""
-POSE = "control 'pose'"
-"""An argument of the library that corresponds to two options."""
+NEEDS = {"plot": "matplotlib", "view": "websockets"}  # modules of the extra 'view' that verbs need
+POSE = "control 'pose'"  # an argument of the library that corresponds to two options
 
-LONGEST, WIDEST = 1000, 120
-"""Characters of a table's cell that are printed, and of a cell that widens its column."""
-MOMENT, TICK = 0.4, 0.5
-"""Seconds of silence before a task is named, and between two updates of its time."""
-CLEAR = "\r\x1b[K"
-"""Terminal sequence that moves to the start of the line and clears it."""
+LONGEST, WIDEST = 1000, 120  # characters of a table's cell that are printed, and of a cell that widens its column
+MOMENT, TICK = 0.4, 0.5  # seconds of silence before a task is named, and between two updates of its time
+CLEAR = "\r\x1b[K"  # terminal sequence that moves to the start of the line and clears it
 
 
 def in_options(text: str) -> str:

@@ -16,8 +16,7 @@ from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_outpu
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 
-FAILED_IF = 3
-"""Exit status of a run for which a condition of --fail-if holds."""
+FAILED_IF = 3  # exit status of a run for which a condition of --fail-if holds
 
 if TYPE_CHECKING:
     from ..bag.writer import Bag

@@ -8,13 +8,11 @@ from contextlib import contextmanager
 
 from ..errors import SimulationError
 
-INTERRUPTED = 130
-"""Exit status after a request to end."""
+INTERRUPTED = 130  # exit status after a request to end
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 STOP_TIMEOUT = 5.0  # s in which the present work must end after a request
 CLEAN_UP = 1.0  # s after an interrupt in which further ones are ignored
-_interrupts: list[float] = []
-"""Times of the interrupts by the monotonic clock, s."""
+_interrupts: list[float] = []  # times of the interrupts by the monotonic clock, s
 
 
 def interrupt(_number: int, _frame: object) -> None:

@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 
 from ..plant.robot import Robot
 
-Scalar = Any
-"""A float or an Expression."""
-Array = NDArray[Any]
-"""Array of numbers, or of numbers and expressions."""
-Frame = tuple[Array, Array]
-"""R and p of the transform a = R b + p."""
+Scalar = Any  # a float or an Expression
+Array = NDArray[Any]  # array of numbers, or of numbers and expressions
+Frame = tuple[Array, Array]  # R and p of the transform a = R b + p
 
 
 @dataclass(frozen=True)
@@ -148,8 +145,7 @@ def joint_tree(robot: Robot, links: Sequence[FreeLink] = ()) -> JointTree:
     return replace(constants, body=_regrouped(constants))
 
 
-SKEW = 0.1
-"""Sine of the angle between two axes above which their common normal is well conditioned."""
+SKEW = 0.1  # sine of the angle between two axes above which their common normal is well conditioned
 
 
 def _frames(axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]) -> list[Frame]:

@@ -26,8 +26,7 @@ from ..notebook import busy
 from ..version import install
 
 LOG = logging.getLogger(__name__)
-Run = Callable[[Sequence[str], Path, Mapping[str, str]], None]
-"""Run a command in a folder, with environment variables."""
+Run = Callable[[Sequence[str], Path, Mapping[str, str]], None]  # run a command in a folder, with environment variables
 TARGETS: dict[str, tuple[str, ...]] = {
     "linux64": ("x86_64-linux-gnu.2.17",),
     "win64": ("x86_64-windows-gnu",),
@@ -42,8 +41,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name), 3: tuple(name for name in TARGETS if "-" in name)}
 """Platforms by version of FMI."""
 ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
-UNITS = ("directional.c", "fmu.c")
-"""The C files that are compiled; they include the others."""
+UNITS = ("directional.c", "fmu.c")  # the C files that are compiled; they include the others
 EXTENSIONS = {
     name: ".dylib" if "macos" in zig[0] else ".dll" if "windows" in zig[0] else ".so" for name, zig in TARGETS.items()
 }
@@ -64,15 +62,12 @@ check for infinities. Vectorisation of scalars takes long and gains nothing. gcc
 joints only at -O3, zig already at -O2.
 """
 
-WINDOWS = "windows.c"
-"""The additional C file of a library for Windows."""
+WINDOWS = "windows.c"  # the additional C file of a library for Windows
 WINDOWS_RUNTIME = ("math", "heap", "stdio", "string", "private")
 """Parts of the Universal C Runtime, which Windows includes since version 10."""
 FOLDER = "twodof"  # in the cache
-KEPT_FOR = 30 * 86400.0
-"""s after which an unused library is removed from the cache."""
-DIGEST = hashlib.sha256().digest_size
-"""Number of bytes before the library in a cache file."""
+KEPT_FOR = 30 * 86400.0  # s after which an unused library is removed from the cache
+DIGEST = hashlib.sha256().digest_size  # number of bytes before the library in a cache file
 
 
 def standard_headers() -> dict[str, bytes]:

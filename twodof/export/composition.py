@@ -37,8 +37,7 @@ PLACEHOLDERS: Starts = {"x_des": (0.0,) * 3, "quat_des": (0.0, 0.0, 0.0, 1.0)}
 """Provisional start values of targets, for the table with which the real ones are computed."""
 POSE = ("q_start", "v_start", "q_min", "q_max", "gravity")
 """Start values that have their own option, or on which the pose at the start depends."""
-ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
-"""Icon files by version of FMI."""
+ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}  # icon files by version of FMI
 
 
 def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:

@@ -27,8 +27,7 @@ from .python_wrapper import repaired_wrapper
 
 LOG = logging.getLogger(__name__)
 
-Files = dict[str, bytes]
-"""Contents by path inside the FMU."""
+Files = dict[str, bytes]  # contents by path inside the FMU
 
 PYTHONFMU = Path(pythonfmu.__file__).parent
 PYTHONFMU_FILES = ("_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py")

@@ -204,8 +204,7 @@ OF_PARAMETER = {
 LOWER = np.tril_indices(3)
 MOTION, FORCE = ("s", "psi", "chi", "velocity", "acceleration", "R", "origin"), ("coriolis", "inertial", "by_q", "by_v")
 BODY = ("mass", "moment", "inertia")
-LOAD = (*BODY, "p", "B", "f")
-"""Fields of structs in C."""
+LOAD = (*BODY, "p", "B", "f")  # fields of structs in C
 
 
 def _solution(solution: Array, inertial: Array, held: Sequence[str]) -> list[Varied]:

@@ -30,12 +30,10 @@ LOG_CATEGORIES = {
 VENDOR = "twodof"
 AUTHOR = "the twodof developers"
 
-FMI3_TYPES = {"Real": "Float64", "Integer": "Int32"}
-"""Types of FMI 3.0 whose names differ from those of FMI 2.0."""
+FMI3_TYPES = {"Real": "Float64", "Integer": "Int32"}  # types of FMI 3.0 whose names differ from those of FMI 2.0
 SCALAR = ("name", "valueReference", "description", "causality", "variability", "initial")
 """Attributes of ScalarVariable in FMI 2.0; all others belong to its type."""
-SMALL = ("rtol", "atol", "max_step")
-"""Variables whose start value is their nominal value."""
+SMALL = ("rtol", "atol", "max_step")  # variables whose start value is their nominal value
 EFFORTS = ("tau", "tau_cmd", "tau_ext")
 UNITS: dict[str, tuple[str, dict[str, int]]] = {
     "m": ("Length", {"m": 1}),
@@ -57,8 +55,7 @@ UNITS: dict[str, tuple[str, dict[str, int]]] = {
 """Quantity by the names of Modelica's standard library, and exponents of the SI base units, by unit. All factors are 1.
 Gains have no quantity.
 """
-DISPLAY = {"rad": ("deg", 180.0 / math.pi)}
-"""Display units, and their number in one SI unit."""
+DISPLAY = {"rad": ("deg", 180.0 / math.pi)}  # display units, and their number in one SI unit
 
 
 def model_description(

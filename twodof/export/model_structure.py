@@ -13,8 +13,7 @@ from .native import INDICATORS
 UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "InitialUnknowns": "InitialUnknown"}
 """Element names of ModelStructure in FMI 3.0, by those of FMI 2.0."""
 STATES = ("q", "v")
-START = ("q_start", "q_min", "q_max")
-"""Variables on which the start value of q depends."""
+START = ("q_start", "q_min", "q_max")  # variables on which the start value of q depends
 KNOWN = ("payload", "payload_com", "armature")
 INERTIAL = (*KNOWN, *OF_LINKS)
 """Parameters on which the mass matrix depends; KNOWN are those on which the control law's model may depend."""
@@ -23,8 +22,7 @@ IMPACT = (*START, "v_start", *INERTIAL, "rigid_stops")
 OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
 Dependencies = tuple[Sequence[str], str] | tuple[Sequence[str], str, Sequence[str]]
 """Groups on which a variable depends, their elements, and groups of which it depends on its own element only."""
-SENSORS = ("q_resolution", "q_noise", "v_noise", "seed", "v_from_q")
-"""Variables on which the first sample depends."""
+SENSORS = ("q_resolution", "q_noise", "v_noise", "seed", "v_from_q")  # variables on which the first sample depends
 
 
 def _dependencies(control: Control, free: Collection[str]) -> tuple[dict[str, Dependencies], dict[str, Dependencies]]:

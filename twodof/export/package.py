@@ -17,10 +17,8 @@ from ..version import versions
 from .compiler import FOLDER, compiles_for_the_web, host_platform, remember, remembered, zig_cache
 from .fmu_options import FmuOptions
 
-MADE_OF = ("fmu_src", "urdf", "meshes", "export", "plant")
-"""Folders of shipped files."""
-TOOLS = ("pin", "numpy", "scipy", "ziglang")
-"""Packages whose versions influence the content of an FMU."""
+MADE_OF = ("fmu_src", "urdf", "meshes", "export", "plant")  # folders of shipped files
+TOOLS = ("pin", "numpy", "scipy", "ziglang")  # packages whose versions influence the content of an FMU
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 DEFAULT_ARM = b"twodof: the default arm"
 """Beginning of the zip comment of the default arm's FMUs, in any flavour and version."""

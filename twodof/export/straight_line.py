@@ -13,15 +13,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 
-WIDTH = 100
-"""Longest line, in characters."""
+WIDTH = 100  # longest line, in characters
 LONG, BLOCK = 1500, 50
 """Number of statements from which on a function has branches, and of statements between two branches.
 
 LLVM's scheduler and register allocator take time quadratic in a basic block; branches make short functions slower.
 """
-STRUCTS = {"turn": "JointPosition"}
-"""Result types of C functions that return a struct."""
+STRUCTS = {"turn": "JointPosition"}  # result types of C functions that return a struct
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,8 +89,7 @@ def operations(results: Iterable[Value]) -> int:
     return sum(1 for _, operands in nodes if operands)
 
 
-Varied = tuple[Value, Value]
-"""A value and its variation."""
+Varied = tuple[Value, Value]  # a value and its variation
 
 
 def varied(

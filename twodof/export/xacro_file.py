@@ -27,8 +27,7 @@ from ..files import check_file, fits, parsed
 from ..version import install
 
 LOG = logging.getLogger(__name__)
-ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
-"""Audit events without effect outside the process."""
+ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}  # audit events without effect outside the process
 LONGEST = 6  # bytes of a character in JSON
 MAX_REMARKS = 2000  # characters
 

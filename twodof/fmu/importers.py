@@ -182,8 +182,7 @@ TOOLS: dict[str, tuple[str, Run, str]] = {
 """Python packages of the tools, functions that run them, and the versions of FMI with which they are tried."""
 
 
-READ_AT_START = "", "fmpy"
-"""Tools whose runs begin with the outputs before the first step; "": this master."""
+READ_AT_START = "", "fmpy"  # tools whose runs begin with the outputs before the first step; "": this master
 
 
 def require(tools: Sequence[str]) -> None:

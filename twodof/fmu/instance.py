@@ -315,8 +315,7 @@ class Instance:
         logger.log(LEVELS.get(status, logging.CRITICAL), message)
 
 
-HEARD: WeakValueDictionary[int, Instance] = WeakValueDictionary()
-"""Instances of FMI 2.0 by their environment."""
+HEARD: WeakValueDictionary[int, Instance] = WeakValueDictionary()  # instances of FMI 2.0 by their environment
 
 
 def _pass_on(environment: int, _name: bytes, status: int, category: bytes, text: bytes) -> None:

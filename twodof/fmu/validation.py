@@ -20,8 +20,7 @@ SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3
 TRUE = ("true", "1")
 NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": TRUE.__contains__}
 """Supported types of variables, and functions that parse their start values."""
-TIMES = {"startTime": 0.0, "stopTime": math.inf, "stepSize": 1.0}
-"""Times of a default experiment, and their defaults."""
+TIMES = {"startTime": 0.0, "stopTime": math.inf, "stepSize": 1.0}  # times of a default experiment, and their defaults
 SCALED = {"deg", "degree", "°", "deg/s", "rpm", "mm", "mm/s", "cm", "N.mm"}
 """Unit names that are known not to be SI units, even if the description does not define them."""
 RELATIVE = "relativeQuantity"

@@ -24,10 +24,8 @@ from .mesh_readers import serve
 LOG = logging.getLogger(__name__)
 ReadMesh = Callable[[str], bytes | None]
 """Function that returns the bytes of a mesh by its name ``meshes/…``, or None if it is missing."""
-Colour = tuple[float, float, float]
-"""Red, green and blue, from 0 to 1."""
-COLOURED = (".dae", ".obj")
-"""Formats with colours."""
+Colour = tuple[float, float, float]  # red, green and blue, from 0 to 1
+COLOURED = (".dae", ".obj")  # formats with colours
 MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
 """Formats whose geometry is in the file itself; others, such as glTF, read it from further files."""
 SHAPE, COLOURS, LIBRARY = "shape", "colours", "colours.mtl"

@@ -14,8 +14,7 @@ from .parameters import Dynamics
 from .prediction import Prediction, deviation, predict
 from .stretches import Array, Stretch
 
-Table = Sequence[Sequence[str]]
-"""Rows of texts; the first is the heading."""
+Table = Sequence[Sequence[str]]  # rows of texts; the first is the heading
 
 
 class Curve(NamedTuple):

@@ -15,21 +15,17 @@ from .parameters import SEEN, Parameters, Values
 from .regression import EDGES, Rows, information_root, residual, rows_of
 from .stretches import Array, Stretch
 
-PRIOR = 3.0
-"""Standard deviation, in scales, of the weak prior, which fixes directions that the data do not determine."""
+PRIOR = 3.0  # standard deviation, in scales, of the weak prior, which fixes directions that the data do not determine
 TOLERANCE, STEPS, LAST_STEPS = 1e-8, 15, 40
 """Relative tolerance of a solution, and its most steps, before the last estimate of noise and after it."""
 PASSES, FIRST_NOISE = 6, 0.02
 """Number of estimates of the noise variances, and the initial noise, as a fraction of the efforts."""
-DELAY_SCALE, LARGEST_SHIFT = 0.02, 5e-4
-"""Scale of the delay, and its largest change without new rows, s."""
+DELAY_SCALE, LARGEST_SHIFT = 0.02, 5e-4  # scale of the delay, and its largest change without new rows, s
 LARGEST_TURN = 0.01  # rad or m: largest change of an offset after the last linearisation of the rows
 FEWEST = 20  # rows for the estimate of a bin's noise
 PROPORTIONAL = np.linspace(0.0, 0.95, 20)  # parts of the noise's variance that grow with the square of the effort
-PRIOR_SHARE = 0.1
-"""Share of the prior in the variance of a value, above which the data do not determine the value."""
-SHARP = 0.05
-"""Standard deviation relative to a value, below which the data determine it whatever the prior's share."""
+PRIOR_SHARE = 0.1  # share of the prior in the variance of a value, above which the data do not determine the value
+SHARP = 0.05  # standard deviation relative to a value, below which the data determine it whatever the prior's share
 NORMAL_95 = 1.959964
 
 

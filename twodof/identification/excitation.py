@@ -40,21 +40,16 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 SHORTEST, LONGEST = 5.0, 120.0  # s
-HARMONICS, HIGHEST = 6, 1.0
-"""Number of harmonics of a joint, and the highest frequency, Hz."""
-MARGIN = 0.9
-"""Part of the limits that the motion uses, because efforts are those of the URDF's masses."""
+HARMONICS, HIGHEST = 6, 1.0  # number of harmonics of a joint, and the highest frequency, Hz
+MARGIN = 0.9  # part of the limits that the motion uses, because efforts are those of the URDF's masses
 REACH, SPEED = np.pi, 2.0
 """Range to both sides, rad or m, and speed, rad/s or m/s, of joints that have no limits in the URDF."""
-COARSE, FINE = 0.1, 0.002
-"""Time between samples of the design and of the result, s."""
+COARSE, FINE = 0.1, 0.002  # time between samples of the design and of the result, s
 POINTS = 5  # samples from one point of a trajectory to the next, between which it is quintic
 CANDIDATES, GENERATIONS, BOUND = 30, 60, 6.0
 """Number of random motions from which the search begins, its steps, and the bound of its coefficients."""
-MOST_WORK = 4e9
-"""Work of a search, some minutes: samples × joints × p (p + 20) of each evaluation, for p parameters."""
-HALVINGS = 8
-"""Bisections of the size of a motion to the effort limits."""
+MOST_WORK = 4e9  # work of a search, some minutes: samples × joints × p (p + 20) of each evaluation, for p parameters
+HALVINGS = 8  # bisections of the size of a motion to the effort limits
 
 
 class Excitation(NamedTuple):

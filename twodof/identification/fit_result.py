@@ -22,16 +22,13 @@ from .curves import Curve, Table
 from .model_tests import ERRORS, Hold, Misfit, Suspect
 from .prediction import WINDOW
 
-MOST_NAMES = 6
-"""Largest number of parameters that the page names in its verdict."""
+MOST_NAMES = 6  # largest number of parameters that the page names in its verdict
 UNEXPLAINED = 0.01
 """Slow residuals that are not noise, as a fraction of the efforts, above which the model does not explain the data."""
 FRAGILE = 3.0
 """Change of a value by an error that the data cannot show, in standard deviations, above which a remark names it."""
-ALIKE = 100.0
-"""Ratio of the probabilities of two errors, below which the data do not tell one from the other."""
-MOST_COMBINATIONS = 5
-"""Largest number of combinations that the summary lists."""
+ALIKE = 100.0  # ratio of the probabilities of two errors, below which the data do not tell one from the other
+MOST_COMBINATIONS = 5  # largest number of combinations that the summary lists
 
 
 class FittedParameter(NamedTuple):

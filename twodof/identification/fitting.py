@@ -36,10 +36,8 @@ SURE, SEPARATE = 10.0, 1e-6
 """Standard deviations above 0, and relative singular value, from which on data determine a load."""
 LEAST_LOAD = 1e-3
 """Load of a joint by gravity in one direction, as part of that in others, below which it is an error of rounding."""
-WRONG_UNITS = 300.0
-"""Ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected."""
-WRONG_RANGE = 3.0
-"""Ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected."""
+WRONG_UNITS = 300.0  # ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected
+WRONG_RANGE = 3.0  # ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected
 POSITIVE = ("friction", "damping", "armature", "payload", "mass")
 GRAVITY = (0.0, 0.0, -9.81)
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ..plant.urdf import INERTIA
 
 Array = NDArray[np.float64]
-Numbers = NDArray[Any]
-"""Real numbers, or complex ones for derivatives."""
+Numbers = NDArray[Any]  # real numbers, or complex ones for derivatives
 
 
 def inertia_of(second: Numbers) -> Numbers:

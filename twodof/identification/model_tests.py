@@ -17,8 +17,7 @@ LEAST_NOISE = 5e-4
 """Noise as a fraction of the efforts, below which errors of filter and spline are not small beside it."""
 SEPARATE = 1e-6
 """Part of the power of an error that the coordinates cannot replace, below which the error is not tested."""
-SIGNIFICANCE = 1e-4
-"""Probability of residuals below which they are not noise."""
+SIGNIFICANCE = 1e-4  # probability of residuals below which they are not noise
 ALARMS, OF_LOADS = 0.005, 1e-4
 """Probability that the residuals of a right model show an error of the setup, by the nominal distribution; and that for
 friction in proportion to the load. Noise in proportion to the effort is largest where that friction is, which makes its
@@ -26,8 +25,7 @@ statistic too large: at 0.005, it was reported in 3 of 70 right recordings of a 
 """
 LEAST_FILTER = 0.5 * (2.0 * np.pi * 25.0) ** -2
 """Size of the filter of positions at 100 Hz, s²: near rests, its ripple looks like a filter of smaller size."""
-SLOW = 2
-"""Number of bins in which a filter is tested: in faster ones, the noise of accelerations looks like a filter."""
+SLOW = 2  # number of bins in which a filter is tested: in faster ones, the noise of accelerations looks like a filter
 
 ERRORS = {
     "gravity": "a base that is tilted by about {size:.2g} {unit} (free '{name}')",

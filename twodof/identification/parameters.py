@@ -44,15 +44,13 @@ OF_THE_ROBOT = ("payload", "payload_com", "gravity")
 OF_THE_SETUP = ("gravity", "offset", "gain", "bias")
 EXPONENTS, BOUNDED = ("mass", "gain"), ("friction", "damping", "armature", "payload")
 """Groups of values exp(x), and groups of values that are at least 0."""
-SIZES = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}
-"""Number of coordinates, where it is not 1."""
+SIZES = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}  # number of coordinates, where it is not 1
 SCALES = {"mass": 1.0, "gain": 1.0, "gravity": 0.5, "com": 0.1, "payload_com": 0.1, "offset": 0.2}
 """Scales of coordinates that do not depend on the robot: deviations so large that the coordinate would be unknown."""
 ROWS, COLUMNS = np.tril_indices(3)
 LEAST_MOMENT = 1e-3  # fraction of m·(5 cm)²: smallest initial second moments of mass of a free inertia
 LEAST_PAYLOAD = 0.01  # fraction of the moving mass: smallest initial payload if its position is free
-SEEN = 0.5
-"""The data determine a direction if its standard deviation is below this fraction of the parameters' scales."""
+SEEN = 0.5  # the data determine a direction if its standard deviation is below this fraction of the parameters' scales
 
 
 @dataclass

@@ -26,10 +26,8 @@ LOG = logging.getLogger(__name__)
 
 BAND, MOST_BAND, LEAST_BAND = 0.1, 20.0, 2.0
 """Band of the fit: fraction of the sampling rate, and upper and lower bound in Hz."""
-MOST_NOISE = 3e-4
-"""Largest share of noise in the power of accelerations; noise in regressors makes inertias too small."""
-CUTOFF, ORDER = 2.5, 5
-"""Cut-off of the filter of positions as a multiple of the band, and its order in one direction."""
+MOST_NOISE = 3e-4  # largest share of noise in the power of accelerations; noise in regressors makes inertias too small
+CUTOFF, ORDER = 2.5, 5  # cut-off of the filter of positions as a multiple of the band, and its order in one direction
 GAP, FINE = 3.5, 0.01
 """Multiple of the usual time between samples that counts as a gap, and the least usual time that counts for it, s."""
 SHORTEST = 2.0  # s: shortest stretch between gaps

@@ -40,10 +40,8 @@ RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 LIMITS = ("low", "high", "effort", "velocity")  # of a joint
 GRAIN = 65535  # resolution of vertices, as parts of a mesh's size
 POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
-PAGES = ("", ".html")
-"""Suffixes of pages."""
-CONTAINER = b'<div class="arm" id="arm"'
-"""Mark that identifies a page with an arm."""
+PAGES = ("", ".html")  # suffixes of pages
+CONTAINER = b'<div class="arm" id="arm"'  # mark that identifies a page with an arm
 
 
 def names_page(path: Path) -> bool:

@@ -28,8 +28,7 @@ MOST_NOTES = 4
 MOST_ORDERS = 16  # waiting requests above which a page's messages are read later
 MOST_STEPS = 10  # steps in one request
 IDLE = 0.05  # s between two checks of ``stop``
-TOLD = ("x_des", "quat_des", "q_des")
-"""Inputs sent with a sample."""
+TOLD = ("x_des", "quat_des", "q_des")  # inputs sent with a sample
 
 
 class PartialBag(Bag):

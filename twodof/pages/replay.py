@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     import pandas
     from typing_extensions import Unpack
 
-FILMS = (".mp4", ".webp", ".gif", ".png")
-"""Suffixes of films, and of the picture at the end."""
+FILMS = (".mp4", ".webp", ".gif", ".png")  # suffixes of films, and of the picture at the end
 MOST_SAMPLES = 100_000  # of a bag with more samples, at most a quarter of this number is shown
 NO_ROBOT = '<robot name="none"><link name="base"/></robot>'
 IDLE = 0.05  # s between two checks of ``stop``

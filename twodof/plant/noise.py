@@ -13,8 +13,7 @@ ROUNDS = 10
 WORD = 2**32 - 1
 LN2 = 0.6931471805599453
 SQRT_HALF = 0.7071067811865476
-TERMS = 11
-"""Terms of the logarithm's series; the rest is below rounding."""
+TERMS = 11  # terms of the logarithm's series; the rest is below rounding
 
 
 def philox(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -9,8 +9,7 @@ from math import inf, sqrt
 
 import numpy as np
 
-WELL_CONDITIONED = 1e-3
-"""Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12."""
+WELL_CONDITIONED = 1e-3  # bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12
 ORTHOGONAL = 2.0**-50
 """Two rows count as orthogonal if the cosine of their angle, or the ratio of their lengths, is below this. If the ratio
 is, the shorter row is the rounding error of a linearly dependent row.

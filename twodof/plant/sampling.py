@@ -18,14 +18,10 @@ from .control_law import ControlledPlant
 from .integrator import Budget, advance
 from .noise import normal_pair
 
-MOST_PERIODS = 10
-"""Longest delay, in periods."""
-TIME_TOLERANCE = 1e-9
-"""Tolerance for equal times, relative to max(1 s, |t|)."""
-PART_OF_PERIOD = 1e-3
-"""Tolerance for equal times, relative to the period."""
-WHOLE = 2.0**53
-"""Doubles of this size or larger are integers."""
+MOST_PERIODS = 10  # longest delay, in periods
+TIME_TOLERANCE = 1e-9  # tolerance for equal times, relative to max(1 s, |t|)
+PART_OF_PERIOD = 1e-3  # tolerance for equal times, relative to the period
+WHOLE = 2.0**53  # doubles of this size or larger are integers
 
 
 @dataclass

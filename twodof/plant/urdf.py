@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 from .numerals import number
 
-UNBOUNDED = 1.7976931348623157e308
-"""Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
+UNBOUNDED = 1.7976931348623157e308  # magnitude of q_min and q_max that stands for "no limit" (the largest double)
 
 NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")

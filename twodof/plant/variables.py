@@ -132,13 +132,11 @@ CONTROLS = {
 "pose" is "task" with three more rows.
 """
 
-ON_REQUEST = ("M", "h", "J", "drift")
-"""Groups of outputs that only ``FmuOptions.outputs`` adds."""
+ON_REQUEST = ("M", "h", "J", "drift")  # groups of outputs that only ``FmuOptions.outputs`` adds
 DISTURBANCES = ("tau_ext", "f_ext")
 FREE = ("gravity", "payload", "payload_com", "friction", "damping", "armature")
 """Groups of parameters that may be inputs, which can change during a run and have derivatives."""
-OF_LINKS = ("mass", "com", "inertia")
-"""Groups of values of links, which are constants unless they are inputs."""
+OF_LINKS = ("mass", "com", "inertia")  # groups of values of links, which are constants unless they are inputs
 OF_THE_PLANT = {
     *DISTURBANCES,
     *("x", "xd", "quat", "omega", "q_start", "v_start", "q_min", "q_max", "rtol", "atol", "max_step"),

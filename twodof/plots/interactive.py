@@ -30,8 +30,7 @@ ROW, GAP, EDGE, TOP = 150, 34, 44, 50
 """Height of a panel, distance between panels, and margins below and above all panels, pixels. The margin above has
 space for the heading and plotly's buttons.
 """
-Chart = JsonObject
-"""A figure of plotly, or a part of one, as JSON."""
+Chart = JsonObject  # a figure of plotly, or a part of one, as JSON
 LAYOUT: Chart = {
     "font": {"family": "sans-serif", "size": 12, "color": INK},
     "plot_bgcolor": "white",

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 MOST_RUNS, MOST_VALUES = 20_000, 1_000_000  # runs on a page, and their values; of more, an evenly spaced selection
 MOST_NUMBERS = 2_000_000  # points of all curves of a page; later runs have no curves
-MOST_CURVES, POINTS = 2000, 200
-"""Number of runs whose curves a page contains, and of points in each curve."""
+MOST_CURVES, POINTS = 2000, 200  # number of runs whose curves a page contains, and of points in each curve
 CROSSES = "×: beyond the URDF's effort or velocity limits"
 HOLLOW = "hollow: not defined, as the settling time of a run that did not settle"
 

@@ -16,12 +16,10 @@ from .strokes import ALARM, PALE, SMALLEST_ERROR, SMALLEST_RANGE, LineStyle, Str
 from .track import JointTrack, Track
 
 KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort", "error": "Distance from the target"}
-UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "tau": ("N·m", "N")}
-"""Units of rotating and of sliding joints."""
+UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "tau": ("N·m", "N")}  # units of rotating and of sliding joints
 SMALLEST_EFFORT = 1e-6  # N·m, N: smaller changes are shown as rest
 SMALLEST_PART = 1e-4  # fraction of a value, so that ticks with six digits differ
-CURVE, THIN, THICK = 1.4, 0.9, 4.0
-"""Line widths of curves, of limits and targets, and of closed forms behind curves."""
+CURVE, THIN, THICK = 1.4, 0.9, 4.0  # line widths of curves, of limits and targets, and of closed forms behind curves
 SEEN_IN = {"limit": "q", "friction": "q", "saturation": "tau"}
 MARKS = {"limit": "at its limit", "friction": "sticks", "saturation": "saturated"}
 """Panels in which causes are marked at their first occurrence, and the names of the marks."""

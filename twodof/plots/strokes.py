@@ -12,8 +12,7 @@ from ..bag.downsampling import Indices, extremes
 from ..export.closed_form import Array
 from ..notebook import COLOURS as COLOURS
 
-Style = dict[str, Any]
-"""Keywords of a matplotlib artist."""
+Style = dict[str, Any]  # keywords of a matplotlib artist
 INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
 ALARM = "#D55E00"
 DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))

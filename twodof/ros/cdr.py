@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..simulation.experiments import NANOSECONDS
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.uint8]
-"""Serialised messages of equal length, N × bytes."""
+Rows = NDArray[np.uint8]  # serialised messages of equal length, N × bytes
 
 LITTLE_ENDIAN = b"\0\1\0\0"
 FRAME = 16  # offset of a frame_id, after its length

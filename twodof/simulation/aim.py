@@ -8,8 +8,7 @@ import numpy as np
 from ..bounds import MAX_VALUE
 from .setup import Array
 
-BAND = 0.02
-"""Band of the settling time, as a fraction of the initial error."""
+BAND = 0.02  # band of the settling time, as a fraction of the initial error
 SMALLEST_MOVE = 1e-9  # m: a smaller move counts as a start at the target, without a settling time
 
 

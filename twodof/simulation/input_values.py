@@ -21,8 +21,7 @@ from ..plant.variables import Value as Value
 
 LOG = logging.getLogger(__name__)
 
-Changes = list[tuple[float, dict[str, Value]]]
-"""Ascending times, s, and the new values of inputs at these times."""
+Changes = list[tuple[float, dict[str, Value]]]  # ascending times, s, and the new values of inputs at these times
 KINDS: dict[str, tuple[Callable[[str], Value], str]] = {
     "Real": (number, "a number"),
     "Integer": (lambda cell: array("i", [whole_number(cell)])[0], "a whole number of 32 bits"),

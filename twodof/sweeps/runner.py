@@ -24,10 +24,8 @@ from ..simulation.setup import robot_of
 from ..simulation.stepping import judge_of, stepped
 from ..simulation.verdict import METRICS
 
-Point = tuple[int, tuple[float, ...]]
-"""Number of a run, and the values of the varied variables."""
-Row = tuple[Any, ...]
-"""The columns of the table: number, values, metrics, end time in s, outcome, and message or None."""
+Point = tuple[int, tuple[float, ...]]  # number of a run, and the values of the varied variables
+Row = tuple[Any, ...]  # the columns of the table: number, values, metrics, end time in s, outcome, and message or None
 
 BATCH_TIME = 0.25  # s, of one batch
 MAX_BATCH = 256

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-REPORT: list[Path] = []
-"""The report's folder, if any; the plugin appends it."""
+REPORT: list[Path] = []  # the report's folder, if any; the plugin appends it
 EXACT = 1e-9  # tolerance relative to a limit, for a joint at its stop
 
 
