@@ -24,6 +24,7 @@ typedef struct {
     double inside;                         /* norm of its error, if it exceeds that of y_new; else 0 */
     double margin, margin_new;             /* margins of the rank at y and y_new */
     int crossed;                           /* whether the rank has changed in the communication step */
+    int alone;                             /* the result of acts_alone in the regime */
     Stops stops;
 } Step;
 
@@ -60,7 +61,7 @@ static void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], d
         acceleration_at_rest(step->plant, y, v, slip_of(stops), stops->rank, stops->held, a, effort, margin);
         return;
     }
-    acceleration(step->plant, y, v, slip_of(stops), stops->rank, a, margin);
+    acceleration_if(step->plant, step->alone, y, v, slip_of(stops), stops->rank, a, margin);
     if (stops->any_held)
         restrain(step->plant, stops, y, a, effort);
 }

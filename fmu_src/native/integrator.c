@@ -43,6 +43,7 @@ static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int on_h
     find_regime(step->plant, step->y, on_hold, rank_held ? step->stops.rank : ANY_RANK,
                 hits ? WINDOW * value[MAX_STEP] * coarseness(step->plant) : 0.0, &step->stops,
                 step->K[0] + N_JOINTS, step->effort[0], &step->margin);
+    step->alone = acts_alone(value, slip_of(&step->stops));
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
     step->rounding = rounding_of(&step->stops, step->effort[0]);
 }

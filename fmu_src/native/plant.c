@@ -110,11 +110,11 @@ static int may_saturate(const double value[N_VARIABLES], const JointPosition joi
 
 /* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 if a is the commanded and the actual acceleration. */
 static void add_excess(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
-                       const double v[N_JOINTS], const double given[N_JOINTS],
+                       const double v[N_JOINTS], const double given[N_JOINTS], int held,
                        const double a[N_JOINTS], double sum[N_JOINTS])
 {
     double tau[N_JOINTS], needed[N_JOINTS];
-    if (is_held(value))
+    if (held)
         memcpy(tau, given, sizeof tau);
     else
         wanted_effort(value, joint, v, given, tau);
@@ -136,9 +136,9 @@ static int find_excess(const double value[N_VARIABLES], const JointPosition join
 {
     const double *force = &value[F_EXT];
     double effort[N_JOINTS], further[N_JOINTS];
-    const int accelerates = COMMANDS_ACCELERATION && !is_held(value);
+    const int held = is_held(value), accelerates = COMMANDS_ACCELERATION && !held;
     double *given = accelerates ? a : effort;
-    if (is_held(value)) {
+    if (held) {
         memcpy(given, &value[TAU], sizeof effort);
         rank = 0;
         if (margin)
@@ -159,41 +159,39 @@ static int find_excess(const double value[N_VARIABLES], const JointPosition join
             excess[i] += further[i];
     }
     if (!knows_all(value) || (value[LIMIT_EFFORT] != 0.0 && may_saturate(value, joint, v, a)))
-        add_excess(value, joint, v, given, a, excess);
+        add_excess(value, joint, v, given, held, a, excess);
     return rank;
 }
 
 /* True if nothing acts but τ of a law that knows all: within effort limits, the commanded acceleration is the motion. */
-static int acts_alone(const double value[N_VARIABLES], const int slip[N_JOINTS])
+INTERNAL int acts_alone(const double value[N_VARIABLES], const int slip[N_JOINTS])
 {
     const double *force = &value[F_EXT];
-    if (slip || !knows_all(value) || force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0)
-        return 0;
+    int others = slip || !knows_all(value) || force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0;
     for (int i = 0; i < N_JOINTS; i++)
-        if (value[TAU_EXT + i] != 0.0 || value[DAMPING + i] != 0.0)
-            return 0;
-    return 1;
+        others |= value[TAU_EXT + i] != 0.0 || value[DAMPING + i] != 0.0;
+    return !others;
 }
 
 /* q̈ by the equations of motion at a state, with the given rank of J⁺. Joints slip in the given directions (−1, 1; 0 or
-   NULL: no friction), and joints at rest are free. Returns the rank. The margin, which may be NULL, is negative if the
-   singular values give another rank. */
-INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                          const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
+   NULL: no friction), and joints at rest are free; `alone` is the result of acts_alone. Returns the rank. The margin,
+   which may be NULL, is negative if the singular values give another rank. */
+INTERNAL int acceleration_if(const Plant *plant, int alone, const double q[N_JOINTS], const double v[N_JOINTS],
+                             const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
 {
     JointPosition joint[N_BODIES];
     double excess[N_JOINTS], further[N_JOINTS];
     const double *value = plant->value;
-    const int alone = acts_alone(value, slip), limited = value[LIMIT_EFFORT] != 0.0;
+    const int limited = value[LIMIT_EFFORT] != 0.0;
     int acts = 0;
     if (NEEDS_POSITIONS || limited || !alone)
         place_joints(q, joint);
-    if (alone) {
+    if (COMMANDS_ACCELERATION && alone) {
         rank = command(value, joint, q, v, rank, a, margin);
         if (!limited || !may_saturate(value, joint, v, a))
             return rank;
         memset(excess, 0, sizeof excess);
-        add_excess(value, joint, v, a, a, excess);
+        add_excess(value, joint, v, a, 0, a, excess);
     } else {
         rank = find_excess(value, joint, q, v, slip, rank, a, excess, margin);
     }
@@ -207,6 +205,12 @@ INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const do
             a[i] += further[i];
     }
     return rank;
+}
+
+INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                          const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
+{
+    return acceleration_if(plant, acts_alone(plant->value, slip), q, v, slip, rank, a, margin);
 }
 
 #ifndef IS_COMPLEX
