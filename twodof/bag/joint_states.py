@@ -1,7 +1,5 @@
 """Joint states and targets of a bag, decoded while it is read."""
 
-from __future__ import annotations
-
 import struct
 from array import array
 from collections import Counter

@@ -1,7 +1,5 @@
 """Verb fit: fit a robot's masses and friction to bags of its motion."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

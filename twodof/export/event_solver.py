@@ -3,8 +3,6 @@
 The plant's rules decide which joints rest and slip after an event. SciPy integrates the motion and locates the event.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

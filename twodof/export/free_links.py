@@ -1,7 +1,5 @@
 """Masses, centres of mass and inertias of links as inputs of a native FMU."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import replace

@@ -14,8 +14,6 @@ both continue by the plant's rules. Where a closed form exists it is the referen
 The format is FMI-LS-REF 1.0.0-beta.1 with MA-HS-Experiments and parameter sets of SSP 1.0.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from collections.abc import Iterable, Mapping, Sequence

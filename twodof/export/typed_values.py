@@ -1,7 +1,5 @@
 """Values of variables of each type of FMI 2.0 and 3.0, checked against the type and the variable's own range."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from contextlib import suppress

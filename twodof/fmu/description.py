@@ -1,7 +1,5 @@
 """Read and check the description of an FMU, without running it."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping

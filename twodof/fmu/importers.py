@@ -1,7 +1,5 @@
 """Runs of a reference's stimuli in this master and in other FMI tools, by the name of the tool."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Libraries of FMUs: loading in any thread, and calls that C makes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

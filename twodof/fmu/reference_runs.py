@@ -4,8 +4,6 @@ The format is FMI-LS-REF with MA-HS-Experiments (times in the element TransientS
 parameter sets of SSP 1.0, and CSV. Deviations are relative to a variable's largest magnitude in the results, or to 1.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

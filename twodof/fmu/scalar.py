@@ -1,7 +1,5 @@
 """Scalar variables and elements of arrays of an FMU's description."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace

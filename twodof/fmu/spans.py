@@ -3,8 +3,6 @@
 A call from Python takes longer than a step of a small robot's FMU. Spans are short, so that signals are handled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from ctypes import c_double, c_int, c_size_t, c_void_p
 from functools import partial

@@ -33,7 +33,6 @@ class Dynamics:
     """A robot with gravity, rotors and a point mass (payload) in a frame; n independent joints.
 
     Args:
-        urdf: the robot.
         joints: names of the n joints.
         frame: the link that carries the payload.
         gravity: in the root's axes, m/s².

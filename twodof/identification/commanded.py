@@ -1,7 +1,5 @@
 """Efforts that a control law commanded, for bags without efforts and at changes of held targets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +32,6 @@ def with_efforts(recording: Recording, options: FmuOptions) -> Recording:
     Therefore the mean of both, by the control law, replaces a recorded effort of the law or a missing one.
 
     Args:
-        recording: a bag's recording.
         options: robot and gains of the controller, for a bag with commands and without run.json.
 
     Raises:
@@ -106,7 +103,6 @@ def _efforts(
     """Return the efforts before and after each sample, 2 × N × n.
 
     Args:
-        recording: the samples.
         model: text of the URDF, frame and axes.
         at: times of the samples, in the unit of the schedule, N.
         schedule: values of inputs and parameters with the times from which on they apply.

@@ -1,7 +1,5 @@
 """Efforts and positions along recordings, as measured and as a model gives them before and after a fit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -49,7 +47,6 @@ def compare(
     """Compare two models with all stretches.
 
     Args:
-        robot: the robot.
         models: values of the parameters and delay of the efforts, s, before and after the fit.
         fitted, held: stretches that were fitted and held out.
         finished: called after each simulation of a held-out stretch, two for each.

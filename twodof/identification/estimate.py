@@ -1,7 +1,5 @@
 """Maximum-likelihood estimate of free parameters, and its covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Page of a fit: its verdict, tables, and curves as measured and as the model gives them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from itertools import chain, repeat
@@ -39,7 +37,6 @@ def fit_page(
     """Return a self-contained page.
 
     Args:
-        title: title of the page.
         lines: the verdict, then remarks.
         tables: tables by caption; long ones except the first are folded.
         facts: table at the end of the page.

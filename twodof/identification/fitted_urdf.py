@@ -1,7 +1,5 @@
 """Write fitted numbers into a URDF, and keep its comments, order and all other text."""
 
-from __future__ import annotations
-
 import io
 import re
 
@@ -23,12 +21,6 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
 
     These are friction and damping of joints, and masses, centres and inertias of links. Joints that mimic each other
     share friction and damping in their original proportions.
-
-    Args:
-        text: text of the URDF.
-        urdf: the parsed URDF.
-        parameters: the free parameters.
-        values: values of all parameters.
     """
     tree = parsed(text)
     root = tree.getroot()

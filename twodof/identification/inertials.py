@@ -1,7 +1,5 @@
 """Inertias of links as in a URDF, as second moments of mass, and as dynamic parameters of bodies."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

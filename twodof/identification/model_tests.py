@@ -1,7 +1,5 @@
 """Tests of the model by the residuals of a fit: fast and slow ones, errors of the setup, and rests."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -121,7 +121,6 @@ class Parameters:
         names, units: names and units of their values.
 
     Args:
-        urdf, robot: the robot, read.
         patterns: names or shell patterns.
         gravity: initial gravity, m/s².
 

@@ -1,7 +1,5 @@
 """Simulate the plant under recorded efforts from measured states, for comparison with the measured motion."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -48,10 +46,7 @@ def predict(robot: Robot, values: Dynamics, delay: float, stretch: Stretch) -> P
     """Simulate a stretch in windows, each from the measured state at its beginning.
 
     Args:
-        robot: the robot.
-        values: values of its parameters.
         delay: delay of the recorded efforts, s.
-        stretch: the samples.
     """
     plant, h = plant_of(robot, values, stretch.step), stretch.step
     edges = stretch.t[:, None] + np.array([0.0, 0.5 * h]) - delay  # beginning and middle of each step

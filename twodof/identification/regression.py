@@ -12,8 +12,6 @@ IEEE TCST 22, 2014, for the regression; Whittle, "Estimation and information in 
 likelihood by frequency.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import pairwise
@@ -67,8 +65,6 @@ def regressors(robot: Robot, stretch: Stretch, values: Dynamics, varying: NDArra
     The last column is the effort of the inertial parameters that do not vary.
 
     Args:
-        robot: the robot.
-        stretch: samples of its motion.
         values: true minus measured positions, and inertial parameters.
         varying: indices of the m inertial parameters that vary.
     """
@@ -255,8 +251,6 @@ def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
     """Return the derivative of ``residual`` with respect to each coordinate and, last, the delay.
 
     Args:
-        rows: rows of one joint.
-        values: values of the parameters.
         rates: derivatives of the values with respect to the coordinates, which are the last axis.
     """
     i, gain = rows.joint, values.gain[rows.joint]

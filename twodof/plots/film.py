@@ -1,7 +1,5 @@
 """Film of a run, drawn without a display: the arm in its workspace, in the views of the run's figure."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import suppress

@@ -63,7 +63,6 @@ class Cluster:
     A thread communicates with Dask, because Dask can wait without end for a peer that does not answer.
 
     Args:
-        address: address of the scheduler.
         stop: called repeatedly; True ends the sweep.
 
     Raises:

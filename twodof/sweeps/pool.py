@@ -20,7 +20,6 @@ class Pool:
     """Worker processes, which are replaced when they die, as a context that needs at least one of them.
 
     Args:
-        count: number of processes.
         stop: called repeatedly; True ends the sweep.
 
     Raises:

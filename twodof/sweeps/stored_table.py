@@ -1,7 +1,5 @@
 """Read the Parquet files of a sweep's table, which are untrusted, in bounded memory."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
