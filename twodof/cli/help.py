@@ -9,60 +9,15 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import choice, nearest
+from ..files import data_file
 from ..plant.numerals import number, whole_number
 from .printing import plain
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-EXAMPLES = {
-    "": ["twodof build", "twodof run", "twodof help run"],
-    "build": [
-        "twodof build",
-        "twodof build my_robot.urdf --mesh-dir my_packages --frame tool0",
-        "twodof build --robot panda --native",
-        "twodof build my_robot.urdf --control joint --native --platform all",
-    ],
-    "run": [
-        "twodof run",
-        "twodof run my_robot.fmu -o my_bag --set x_des=0.4,0.1,0.5 --set Kp=100 --scene",
-        "twodof run my_robot.fmu --input targets.csv --stop-time 20 --step 0.005",
-    ],
-    "publish": [
-        "twodof publish my_robot.fmu --scene --effort",
-        "twodof publish left=my_robot.fmu right=my_robot.fmu --clock -o my_bag",
-    ],
-    "layouts": [
-        "twodof layouts my_robot.fmu -o layouts",
-        "twodof layouts left.fmu --namespace left -o layouts_of_left",
-    ],
-    "info": ["twodof info my_robot.fmu", "twodof info my_bag", "twodof info my_sweep --json"],
-    "check": ["twodof check my_robot.fmu", "twodof check my_robot.fmu --with libcosim"],
-    "linearise": ["twodof linearise TwoDof-native.fmu", "twodof linearise my_robot.fmu --at q=0.5,0.35 --at Kp=100"],
-    "fit": [
-        "twodof fit my_robot.urdf my_bag --free 'friction[*]' --free payload",
-        "twodof fit my_robot.urdf --design 20 --free 'friction[*]' --free payload -o excite.csv",
-        "twodof fit my_robot.urdf monday tuesday --free 'mass:*' --free 'com:*' --free 'inertia:*' -o fitted",
-    ],
-    "plot": [
-        "twodof plot my_bag",
-        "twodof plot my_bag other_bag -o comparison.png --joints joint1,joint2",
-        "twodof plot my_sweep -o map.html",
-    ],
-    "view": ["twodof view my_bag", "twodof view my_bag --export my_bag.html"],
-    "live": ["twodof live", "twodof live my_robot.fmu --set Kp=100"],
-    "page": ["twodof page", "twodof page my_robot.fmu -o my_robot.html"],
-    "sweep": [
-        "twodof sweep --grid Kp=20:200:10 --grid Kd=5:40:8",
-        "twodof sweep my_robot.fmu --range Kp=20:200 --random 500 -o my_sweep",
-    ],
-    "export": [
-        "twodof export my_bag -o my_bag.csv",
-        "twodof export my_bag -o my_bag.mcap",
-        "twodof export monday tuesday -o my_robot.lerobot",
-    ],
-    "recover": ["twodof recover my_bag", "twodof recover /media/stick/my_bag"],
-}
+_BLOCKS = [block.splitlines() for block in data_file("cli", "examples.txt").read_text("utf-8").split("\n\n")]
+EXAMPLES = {"": _BLOCKS[0], **{lines[0].split()[1]: lines for lines in _BLOCKS[1:]}}  # command lines by verb
 ALIKE = 0.7  # ratio of difflib from which on a verb or option may be meant
 MEANT = {
     word: meant
