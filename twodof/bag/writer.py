@@ -78,11 +78,7 @@ class Bag(Sink):
         self.count = 0
 
     def of(self, namespace: str) -> Bag:
-        """Return a sink for one of several robots, whose topics have a namespace in the same bag.
-
-        Raises:
-            InputError: the namespace is not a name of ROS 2.
-        """
+        """Return a sink for one of several robots, whose topics in the same bag have a namespace of ROS 2."""
         check_name("namespace", namespace)
         robot = copy(self)
         robot.namespace = namespace.strip("/")
@@ -99,11 +95,7 @@ class Bag(Sink):
         return self._named(JOINT_STATES)
 
     def begin(self, run: Experiment) -> Bag:
-        """Receive the experiment of the following samples.
-
-        Raises:
-            BagError: the FMU lacks a requested output.
-        """
+        """Receive the experiment of the following samples; BagError: the FMU lacks a requested output."""
         self._run = run
         self._inputs = run.start_values
         # letters beyond ASCII stay: rerun and Pinocchio do not decode names, and RViz and Foxglove take both

@@ -17,11 +17,7 @@ SOON, MOST_EVENTS = 1e-11, 1000
 
 
 def advanced(plant: Plant, h: float, method: str, tolerance: float) -> Array:
-    """Return the state (q, v) after h seconds with inputs held, by a solver of SciPy from one event to the next.
-
-    Raises:
-        BuildError: there are too many events.
-    """
+    """Return the state (q, v) after h seconds with inputs held, by SciPy between events, of limited number."""
     from scipy.integrate import solve_ivp  # which takes 0.4 s to import, and most builds have no references
 
     n, t, y, idle = len(plant.q), 0.0, np.array([*plant.q, *plant.v]), [False] * len(plant.q)

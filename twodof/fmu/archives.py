@@ -29,11 +29,7 @@ def open_archive(path: Path, inside: str, *, checked: bool = False) -> Iterator[
 
 
 def read_archive(path: Path, inside: str) -> tuple[bytes, dict[str, int]]:
-    """Return modelDescription.xml and the members' checksums of an FMU that is safe to unzip.
-
-    Raises:
-        FmuError: the file is missing, damaged, unsafe or no FMU.
-    """
+    """Return modelDescription.xml and the members' checksums of an FMU that is safe to unzip; else raise FmuError."""
     where = Path(path, inside)
     try:
         with open_archive(path, inside, checked=True) as archive:

@@ -269,11 +269,7 @@ def logged(fmu: Fmu) -> Fmu:
 
 @contextmanager
 def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
-    """Open the FMU's file, if it is still the file whose description was read.
-
-    Raises:
-        FmuError: the file was replaced meanwhile, or cannot be read.
-    """
+    """Open the FMU's file, if it is still the file whose description was read; else raise FmuError."""
     try:
         with open_archive(fmu.path, fmu.inside) as archive:
             if checksums(archive) != fmu.members:

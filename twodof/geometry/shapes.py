@@ -147,11 +147,7 @@ def _colour(visual: ET.Element, named: Mapping[str | None, ET.Element]) -> Colou
 
 
 def floats(element: ET.Element | None, key: str, default: str) -> Array:
-    """Return the numbers of an attribute.
-
-    Raises:
-        ValueError: it is too long, or has a value that is not a number.
-    """
+    """Return the numbers of an attribute; ValueError: it is too long, or has a value that is not a number."""
     text = default if element is None else element.get(key, default)
     if len(text) > MAX_NAME:  # many visuals may share a material
         raise ValueError(f"{key} has more than {MAX_NAME} characters")

@@ -204,11 +204,7 @@ def _check_all_units(parameters: Parameters, fitted: Sequence[Stretch], recordin
 
 
 def _check_units(parameters: Parameters, fitted: Sequence[Stretch], bag: str) -> None:
-    """Refuse positions of a bag far beyond the URDF's range, and efforts that differ much from those of its masses.
-
-    Raises:
-        InputError: the message has the positions or the ratio.
-    """
+    """Refuse positions of a bag far beyond the URDF's range, and efforts that differ much from those of its masses."""
     robot = parameters.robot
     for i, joint in enumerate(robot.joints):
         least = min(float(each.measured[:, i].min()) for each in fitted)

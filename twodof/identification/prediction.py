@@ -43,11 +43,7 @@ def plant_of(robot: Robot, values: Dynamics, step: float) -> Plant:
 
 
 def predict(robot: Robot, values: Dynamics, delay: float, stretch: Stretch) -> Prediction:
-    """Simulate a stretch in windows, each from the measured state at its beginning.
-
-    Args:
-        delay: delay of the recorded efforts, s.
-    """
+    """Simulate a stretch in windows, each from the measured state at its start; ``delay`` is that of the efforts, s."""
     plant, h = plant_of(robot, values, stretch.step), stretch.step
     edges = stretch.t[:, None] + np.array([0.0, 0.5 * h]) - delay  # beginning and middle of each step
     effort = (

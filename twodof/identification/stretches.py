@@ -159,11 +159,7 @@ def _unwrapped(recording: Recording, robot: Robot, q: Array) -> Array:
 
 
 def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
-    """Refuse positions of which a few samples are far from the samples before and after them, or that jump once.
-
-    Raises:
-        InputError: the message has the joint, the largest spike or jump, and the number of spikes.
-    """
+    """Refuse positions of which a few samples are far from the samples before and after them, or that jump once."""
     low, high = np.percentile(q, (1.0, 99.0), axis=0)
     steps = np.diff(q, axis=0)
     usual = np.percentile(np.abs(steps), 100.0 * (1.0 - 2.0 * SPIKES), axis=0)

@@ -73,11 +73,7 @@ class Foxglove(Sink):
         self._scene, self._effort, self._set_gains = scene, effort, set_gains
 
     def begin(self, run: Experiment) -> Foxglove:
-        """Receive the experiment of the following samples.
-
-        Raises:
-            BagError: the FMU lacks a requested output.
-        """
+        """Receive the experiment of the following samples; BagError: the FMU lacks a requested output."""
         self._messages = Messages(run, scene=self._scene, effort=self._effort)
         self._gains = _Gains(run, self._set_gains)
         return self

@@ -51,11 +51,7 @@ class Command(NamedTuple):
 
 
 def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
-    """Deserialise a message of a type, of limited size.
-
-    Raises:
-        CommandError: the untrusted bytes are not a message of the type.
-    """
+    """Deserialise a message of a type, of limited size; CommandError: the untrusted bytes are no such message."""
     try:
         if len(cdr) > most:
             raise ValueError(f"it has {len(cdr)} bytes")
@@ -65,11 +61,7 @@ def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
 
 
 def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[int, int]]:
-    """Match joints by name: (robot index, message index) pairs.
-
-    Raises:
-        CommandError: the message has no joint of this robot, or names one twice.
-    """
+    """Match joints by name, (robot index, message index); CommandError: the message has none, or one twice."""
     known = [(joints[name], k) for k, name in enumerate(names) if name in joints]
     listed = f"{', '.join(names)[:LONGEST_NAME]!r}"
     if not known:

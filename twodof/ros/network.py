@@ -204,11 +204,7 @@ class OpenDomain(NamedTuple):
 
 
 def open_domain(network: Network) -> OpenDomain:
-    """Open the DDS domain of a network.
-
-    Raises:
-        PublishError: Cyclone DDS cannot open it; the message has Cyclone DDS's reason.
-    """
+    """Open the DDS domain of a network; PublishError: Cyclone DDS cannot open it, with its reason."""
     own = LOOPBACK if network.loopback else None
     opened, used, messages = _try_to_open(network, own)
     if opened and network.range == "LOCALHOST" and not used.keys() & LOOPBACK:
