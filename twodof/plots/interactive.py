@@ -30,9 +30,10 @@ ROW, GAP, EDGE, TOP = 150, 34, 44, 50
 """Height of a panel, distance between panels, and margins below and above all panels, pixels. The margin above has
 space for the heading and plotly's buttons.
 """
+FONT_SIZE = 12  # pixels
 Chart = JsonObject  # a figure of plotly, or a part of one, as JSON
 LAYOUT: Chart = {
-    "font": {"family": "sans-serif", "size": 12, "color": INK},
+    "font": {"family": "sans-serif", "size": FONT_SIZE, "color": INK},
     "plot_bgcolor": "white",
     "paper_bgcolor": "white",
     "showlegend": False,
@@ -218,7 +219,8 @@ def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str,
     high = max(panel.range[1] for panel in panels)
     axis = {**AXIS, "anchor": "x", "domain": [max(bottom, 0.0), top]}
     if panels[0].kind == "error":
-        decades = {"type": "log", "dtick": 3 if high > 1e6 * low else 1}
+        font = {"size": FONT_SIZE / 1.25}  # Plotly enlarges powers of 10
+        decades = {"type": "log", "dtick": 3 if high > 1e6 * low else 1, "tickfont": font}
         return {**axis, **decades, "range": np.log10([low, high]).tolist()}
     pad = 0.04 * (high - low)  # keeps curves away from the edges
     return {**axis, "range": [low - pad, high + pad], "nticks": 6}

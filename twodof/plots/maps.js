@@ -113,7 +113,8 @@ class SweepPage {
       known.map((name) => `${this.title(name)}: ${number(name)}`).join("; "), curves[run]?.verdict ?? "",
     ];
     const command = [...again, ...varied.map((name) => `--set ${quoted[name]}=${columns[name][k]}`)].join(" ");
-    const code = Object.assign(document.createElement("code"), { textContent: command });
+    const code = document.createElement("code"); // no line begins within an option
+    code.append(...command.split(" ").flatMap((word) => [Object.assign(document.createElement("span"), { textContent: word }), " "]));
     this.detail.replaceChildren(...lines.filter(Boolean).map((text) => Object.assign(document.createElement("p"), { textContent: text })), code, this.curve);
     const drawn = Object.entries(curves[run]?.lines ?? {});
     this.curve.hidden = !drawn.length;
