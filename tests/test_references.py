@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from friction_oracle import Rubbing
+from native_models import robots_folder
 from scipy.integrate import solve_ivp
 from systems import pd_fmu, values
 from tools import needs
@@ -419,6 +420,24 @@ def test_damaged_references_fail_their_row(
     files[FOLDER + name] = files[FOLDER + name].replace(old, new)
     found = rows(packed(files, tmp_path / "damaged.fmu"))
     assert any(row.outcome == "failed" and text in row.text for row in found.values()), found
+
+
+@pytest.mark.parametrize(("control", "frame", "urdf"), [
+    ("joint", "link7", "xarm_description/urdf/xarm7.urdf"),
+    ("effort", "gripperMover", "z1_description/urdf/z1.urdf"),
+])  # fmt: skip
+def test_strong_friction_on_light_joints_has_a_reference(
+    control: str, frame: str, urdf: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Their URDFs have no rotors, and friction that alone would decelerate a wrist by 10,000 rad/s²."""
+    options = twodof.FmuOptions(
+        robots_folder() / urdf, frame=frame, control=control, native=True, meshes=False, reference=True
+    )
+    path = twodof.build_fmu(tmp_path / "arm.fmu", options)
+    assert not caplog.messages
+    (rest,) = (reference for reference in references_of(load_any_fmu(path)) if reference.name == "rest")
+    assert rest.tolerance == 1e-8
+    assert {row.outcome for row in rows(path).values()} == {"passed"}
 
 
 def test_a_sensitive_motion_with_impacts_is_left_out(

@@ -4,6 +4,7 @@ The plant's rules decide which joints rest and slip after an event. SciPy integr
 """
 
 from functools import partial
+from math import inf
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from ..plant.plant import Plant
 from ..plant.regime import DORMAND_PRINCE, Motion
 from .closed_form import Array
 
-SOON, MOST_EVENTS = 1e-11, 1000
-"""Time after an event, s, at which rounding no longer hides the sides of bounds; and the most events in one call."""
+SOON, MOST_EVENTS, PASSED = 1e-11, 1000, 1e-11
+"""Time after an event, s, at which rounding no longer hides the sides of bounds; the most events in one call; and the
+distance beyond a stop, rad or m, that shows an event which was not found.
+"""
 
 
 def advanced(plant: Plant, h: float, method: str, tolerance: float) -> Array:
@@ -39,9 +42,20 @@ def advanced(plant: Plant, h: float, method: str, tolerance: float) -> Array:
             event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
         y = np.array(state)
         y, t = y + SOON * rates(t, y), t + SOON
+        hit = {i: end for i, end, side in ends if i < n and side * (y[i] - end) < 0.0}
+        if hit:  # within this time; the solver would find no event
+            y[[*hit]] = [*hit.values()]
+            continue
+        until, before = h, inf
+        while t < until < before:  # again up to the event, if a stop was passed and left in the same step
+            found = solve_ivp(
+                rates, (t, until), y, method, events=events, rtol=tolerance, atol=1e-14, max_step=plant.max_step
+            )
+            last, before = found.y[:, -1], until
+            if any(i < n and side * (last[i] - end) < -PASSED for i, end, side in ends):
+                until = found.t[-1]
         if t < h:
-            found = solve_ivp(rates, (t, h), y, method, events=events, rtol=tolerance, atol=1e-14)
-            t, y = found.t[-1], found.y[:, -1]
+            t, y = found.t[-1], last
         if t >= h:
             return y
         y, t = y + SOON * rates(t, y), t + SOON

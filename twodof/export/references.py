@@ -171,11 +171,19 @@ def _load(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool
 
 
 def _rubbing(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | bool]:
-    """Return the parameters of "rest": rigid stops, and friction for all joints, rounded as in the file."""
-    sizes = ACCELERATION * np.diag(plant.known.mass_matrix(np.array(plant.q)))
+    """Return the parameters of "rest": rigid stops, friction and rotors, rounded as in the file.
+
+    A joint of strong friction and small inertia would otherwise stop within microseconds, and each impact of another
+    joint would let it slip for as short a time. Its state, and the order of such events, would depend on rounding.
+    """
+    mass = np.diag(plant.known.mass_matrix(np.array(plant.q)))
+    starts = [v.start for v in names.values() if v.group == "friction"]
+    friction = np.array([F or ACCELERATION * m for F, m in zip(starts, mass)])
+    groups = {"friction": friction, "armature": plant.armature + np.maximum(0.0, friction / ACCELERATION - mass)}
     values: dict[str, float | bool] = {n: True for n, v in names.items() if v.group == "rigid_stops"}
-    of_joints = {n: v for n, v in names.items() if v.group == "friction"}
-    return values | {n: v.start or float(f"{sizes[v.index or 0]:.9g}") for n, v in of_joints.items()}
+    return values | {
+        name: float(f"{groups[v.group][v.index or 0]:.9g}") for name, v in names.items() if v.group in groups
+    }
 
 
 def _narrowed(plant: Plant, names: Mapping[str, Variable], stimuli: Columns) -> dict[str, float | bool]:
@@ -262,10 +270,13 @@ def _tolerance(plant: Plant, stimuli: Columns, found: Sequence[Columns]) -> tupl
     exact = _closed_form(plant, stimuli, first)
     first |= exact
     scales = {name: max(1.0, float(np.abs(column).max())) for name, column in first.items()}
-    apart = {name: float(np.abs(column - first[name])[ROWS].max()) / scales[name] for name, column in second.items()}
+    off = {name: np.abs(column - first[name])[ROWS] / scales[name] for name, column in second.items()}
+    apart = {name: float(column.max()) for name, column in off.items()}
     worst = max(apart, key=lambda name: apart[name])
     if not apart[worst] <= MOST_TOLERANCE:
-        raise BuildError(f"no references: solvers and closed form differ by {apart[worst]:.2g} in {worst}")
+        began = STEP * ROWS[int((~(np.array([*off.values()]) <= MOST_TOLERANCE)).any(axis=0).argmax())]
+        text = f"solvers and closed form differ by {apart[worst]:.2g} in {worst}, first at {began:g} s"
+        raise BuildError(f"no references: {text}; choose another `q_start`")
     least = EVENT_TOLERANCE if any(plant.friction) else LEAST_TOLERANCE
     return max(least, 10.0 * apart[worst]), [*exact]
 
