@@ -17,6 +17,7 @@ import pytest
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from harness import Recorded
+from tools import needs
 
 from twodof import FmuOptions, build_fmu
 
@@ -228,6 +229,24 @@ def test_runge_kutta_sees_a_short_stop(fmus, importer, fmi, h):
     assert len(solver.asked) == 1 and 0.0 <= solver.asked[0] - WHEN <= h
     assert np.abs(ours - theirs)[:, :2].max() <= 1e-7
     assert not solver.messages
+
+
+@pytest.mark.parametrize("h", [1e-3, 1e-2])
+def test_pathsim_sees_a_short_stop(fmus, h):
+    """1e-2 s is PathSim's default step; inputs without a connection would be 0."""
+    needs("pathsim")
+    from pathsim import Connection, Simulation
+    from pathsim.blocks import Constant
+    from pathsim.solvers import RKDP87
+    from pathsim_fmi import ModelExchangeFMU
+
+    ours = simulated(fmus(), "CoSimulation", TOUCH, 0.3)
+    arm = ModelExchangeFMU(str(fmus()), start_values={**TIGHT, **TOUCH})
+    torque = Constant(TOUCH["tau_cmd[2]"])
+    simulation = Simulation([arm, torque], [Connection(torque, arm["tau_cmd[2]"])], dt=h, Solver=RKDP87, log=False)
+    simulation.run(0.3 - 0.5 * h, adaptive=False)
+    assert simulation.time == pytest.approx(0.3, abs=1e-9)
+    assert np.abs(arm.engine.get()[:2] - ours[-1, :2]).max() <= 1e-7  # 2.5e-3 without the stop
 
 
 def test_a_short_stop_of_a_closed_form(importer):

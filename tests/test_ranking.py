@@ -159,10 +159,12 @@ def test_no_run_beyond_the_limits_is_best(ur5, tmp_path, capsys):
 
 
 def test_runs_that_differ_by_rounding_rank_equally(native_path, tmp_path, capsys):
-    """These values of rcond change the runs by rounding at most."""
-    grid = ["--grid", "rcond=0.001:0.002:3", "--stop-time", "0.3", "-o", str(tmp_path / "s")]
+    """These external torques change the metrics by rounding."""
+    grid = ["--grid", "tau_ext=0:1e-14:3", "--stop-time", "0.3", "-o", str(tmp_path / "s")]
     assert main(["sweep", str(native_path), *grid]) == 0
     assert "\nno single best run: 3 are equal up to rounding\n" in capsys.readouterr().out
+    errors = twodof.read_sweep(tmp_path / "s")["final_error"]
+    assert 1 < len({*errors}) and np.ptp(errors) < 1e-13
 
 
 @pytest.mark.parametrize(
