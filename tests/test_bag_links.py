@@ -86,6 +86,22 @@ def test_a_pipe_in_the_place_of_messages_is_refused(linked, capsys):
         assert line == f"twodof: error: '{file}' is not a regular file; remove it from the bag"
 
 
+def test_more_provenances_and_meshes_than_a_bag_has_are_left_out(linked):
+    """Each file is flushed to the disk, which takes milliseconds."""
+    (linked / "run.json").unlink()
+    (linked / "r0000").mkdir()
+    for i in range(1001):
+        (linked / f"run.r{i:04}.json").write_bytes(b"{}")
+    for i in range(50_001):
+        (linked / f"r0000/{i}").touch()
+    recovered = twodof.recover(linked)
+    assert recovered.counts == {"/joint_states": 11}
+    assert recovered.damage == (
+        "run.*.json files of more than 1000 robots; meshes in 'r0000', because there are more than 50000 files"
+    )
+    assert len([*linked.iterdir()]) == 1002
+
+
 def test_a_pipe_among_the_meshes_is_refused(linked, capsys):
     (linked / "meshes").mkdir(exist_ok=True)
     for name in ("one", "two"):

@@ -985,3 +985,14 @@ def test_options_of_a_single_fmu_are_refused_for_a_system(plant: bytes, pd: byte
     with pytest.raises(FmuError, match="no outputs q"):
         (tmp_path / "pd.fmu").write_bytes(pd)
         twodof.load_fmu(tmp_path / "pd.fmu")
+
+
+def test_a_check_reads_descriptions_of_limited_size(tmp_path: Path) -> None:
+    """Each of a hundred small FMUs can have a description that takes seconds to check."""
+    large = zipped({"modelDescription.xml": b"<fmiModelDescription/>".ljust(6_000_000)})
+    names = [f"c{i}" for i in range(3)]
+    structure = ssd(f"<ssd:Elements>{''.join(map(component, names))}</ssd:Elements>")
+    path = tmp_path / "large.ssp"
+    path.write_bytes(zipped({"SystemStructure.ssd": structure, **{f"resources/{n}.fmu": large for n in names}}))
+    with pytest.raises(twodof.TwoDofError, match=r"large.ssp': its FMUs have descriptions of more than 16777216 bytes"):
+        twodof.check(path)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from rosbags.interfaces import Connection, Qos
@@ -22,10 +23,12 @@ from ..bounds import (
     MAX_COPY_RATIO,
     MAX_DEFINITION,
     MAX_DEFINITIONS,
+    MAX_FILES,
     MAX_MESHES,
     MAX_PROFILES,
     MAX_PROVENANCE,
     MAX_PROVENANCES,
+    MAX_TOPICS,
     MIB,
 )
 from ..errors import BagError, no_such
@@ -151,6 +154,9 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
     damage: list[str] = []
     budget = ReadBudget()
     robots = provenance.robots_of(folder)
+    if len(robots) > MAX_TOPICS:  # each has a topic
+        damage.append(f"run.*.json files of more than {MAX_TOPICS} robots")
+        robots = robots[:MAX_TOPICS]
     others = set()
     writer = BagWriter(new, storage)
     kept = _provenances(folder, robots, damage)
@@ -191,20 +197,30 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
                 writer.storage.describe(provenance.KEY, name, content.decode("utf-8", "replace"))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
-    for kept_folder in {Path(robot).parts[0] if robot else "meshes" for robot in robots}:  # folders of meshes
-        if not (folder / kept_folder).is_dir() or (folder / kept_folder).is_symlink():
-            continue
-        size = sum(file.lstat().st_size for file in (folder / kept_folder).rglob("*"))
-        if size > MAX_MESHES * len(robots):  # a sparse file of a few bytes can have a terabyte
-            damage.append(f"meshes of {size} bytes in '{kept_folder}'")
-        else:
-            shutil.copytree(folder / kept_folder, new / kept_folder, symlinks=True)
+    _copy_meshes(folder, new, robots, damage)
     for name, content in kept.items():
         (new / name).write_bytes(content)
     with Reader(new) as reader:  # the new bag must open in another reader
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     sync(*new.iterdir(), new)
     return counts, "; ".join(damage)
+
+
+def _copy_meshes(folder: Path, new: Path, robots: Sequence[str], damage: list[str]) -> None:
+    """Write the folders of meshes into the new bag; report those that are too large as damage."""
+    room = MAX_FILES
+    for name in {Path(robot).parts[0] if robot else "meshes" for robot in robots}:
+        if not (folder / name).is_dir() or (folder / name).is_symlink():
+            continue
+        found = [*islice((folder / name).rglob("*"), room + 1)]
+        size = sum(file.lstat().st_size for file in found)
+        if len(found) > room:
+            damage.append(f"meshes in '{name}', because there are more than {MAX_FILES} files")
+        elif size > MAX_MESHES * len(robots):  # a sparse file of a few bytes can have a terabyte
+            damage.append(f"meshes of {size} bytes in '{name}'")
+        else:
+            room -= len(found)
+            shutil.copytree(folder / name, new / name, symlinks=True)
 
 
 def _provenances(folder: Path, robots: Iterable[str], damage: list[str]) -> dict[str, bytes]:

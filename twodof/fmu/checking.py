@@ -12,12 +12,13 @@ from pathlib import Path
 from subprocess import DEVNULL
 from typing import NamedTuple
 
-from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_ROW, MIN_STEP
+from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_DESCRIPTIONS, MAX_ROW, MIN_STEP
 from ..children import Child, limit
 from ..errors import FmuError, InputError, SspError
 from ..export.package import has_member
 from ..files import parsed, temporary_folder
 from ..notebook import card
+from .archives import read_archive
 from .description import Fmu, load_any_fmu, problems_of
 from .importers import require
 from .reference_runs import Reference, references_of
@@ -94,6 +95,12 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
         raise InputError(f"'{path}' is a system; `tools` run the references of an FMU: check its FMUs one by one")
     elements = [element for element in read_ssp(path)[1].walk() if element.source]
     names = {element.source: element.name for element in reversed(elements)}
+    size = 0
+    for source in names:
+        size += len(read_archive(path, source)[0])
+        if size > MAX_DESCRIPTIONS:
+            most = f"descriptions of more than {MAX_DESCRIPTIONS} bytes together"
+            raise FmuError(f"'{path}': its FMUs have {most}; check them one by one")
     try:
         system = load_system(path)
         text, remarks = f"{len(system.components)} components, {len(system.links)} connections", system.remarks()
