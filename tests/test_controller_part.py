@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import xml.etree.ElementTree as ET
 import zipfile
@@ -377,4 +378,25 @@ def in_libcosim(tmp_path: Path) -> None:
     assert run.simulate_until(round(STOP * 1e9))
     plant = run.slave_index_from_instance_name("plant")
     theirs = last.last_real_values(plant, [references[f"q[{i}]"] for i in (1, 2)])
+    np.testing.assert_allclose(theirs, delayed(path), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_ecos_runs_a_split_robot(fmi: int, tmp_path: Path) -> None:
+    needs("ecospy")
+    needs("tbb")
+    in_ecos(fmi, tmp_path)
+
+
+@in_child_process
+def in_ecos(fmi: int, tmp_path: Path) -> None:
+    """ecos also delays connections by one step."""
+    from ecospy import EcosSimulation
+
+    path = twodof.build_fmu(tmp_path / "arm.ssp", twodof.FmuOptions(part="split", fmi=fmi))
+    os.environ["TMPDIR"] = str(tmp_path)  # where ecos leaves the files of the SSP
+    with EcosSimulation(step_size=0.01, ssp_path=str(path)) as simulation:
+        simulation.init(parameter_set="initialValues")
+        simulation.step(round(STOP / 0.01))
+        theirs = [simulation.get_real(f"plant::q[{i}]") for i in (1, 2)]
     np.testing.assert_allclose(theirs, delayed(path), rtol=0, atol=1e-12)
