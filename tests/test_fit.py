@@ -198,6 +198,21 @@ def test_a_hidden_spring_is_reported_with_its_joint(tmp_path):
     result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort), FREE, gravity=GRAVITY)
     assert not result.explains
     assert any("does not explain" in line and "'joint2'" in line for line in result.remarks)
+    assert "look like a spring of about 0.099 N·m/rad at joint 'joint2' (it is not part of the model); if" in str(
+        result
+    )
+
+
+def test_a_payload_that_is_not_free_is_the_error_that_the_residuals_look_like(bag, motion, tmp_path):
+    result = twodof.fit(ARM, bag, FREE[:-1], gravity=GRAVITY)
+    assert "the residuals look like a payload of about +0.15 kg (free 'payload', or correct the masses); if" in str(
+        result
+    )
+    q, effort = noisy(motion)
+    sprung = bag_of(tmp_path / "bag", JOINTS, q, effort + 0.05 * q * [1.0, 0.0])
+    result = twodof.fit(ARM, sprung, (*FREE, "bias:*"), gravity=GRAVITY)
+    assert result.suspects[0].name == "spring:joint1"
+    assert result.suspects[0].size == pytest.approx(0.05, rel=0.2)
 
 
 def test_uneven_stamps_leave_values_in_their_intervals():

@@ -121,6 +121,8 @@ def test_a_hidden_spring_of_a_ur5_is_reported_with_its_joint(tmp_path):
     result = twodof.fit(UR5, bag, ("friction[*]", "damping[*]", "payload"), frame="tool0")
     assert not result.explains
     assert any("does not explain" in line and "'elbow_joint'" in line for line in result.remarks)
+    assert result.suspects[0].name == "spring:elbow_joint"
+    assert result.suspects[0].size == pytest.approx(5.0, rel=0.05)
 
 
 def efforts(robot: Any, names: list[str], values: np.ndarray, states: list[np.ndarray]) -> np.ndarray:

@@ -35,5 +35,5 @@ def model_with(model: pin.Model, inertial: Array, gravity: Array) -> pin.Model:
     copy = model.copy()
     copy.gravity.linear = gravity
     for body, ten in enumerate(inertial.reshape(-1, 10)):
-        copy.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
+        copy.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten) if ten.any() else pin.Inertia.Zero()
     return copy

@@ -36,6 +36,8 @@ ERRORS = {
     " speeds of the task)",
     "load": "friction of joint '{joint}' that grows by about {percent:.2g} % of its load (record with the loads of the"
     " task)",
+    "spring": "a spring of about {size:.2g} {effort}/{unit} at joint '{joint}' (it is not part of the model)",
+    "payload": "a payload of about {size:+.2g} kg (free '{name}', or correct the masses)",
     "filter": "{filtered} behind a filter with a time constant of about {ms:.2g} ms (record them without it)",
     "clock": "speeds that need about {percent:+.2g} %, as of a wrong clock",
 }
@@ -98,8 +100,16 @@ def suspects_of(
     rest = errors - J @ replaced
     power, score = np.sum(rest**2, axis=0), rest.T @ r
     power[power <= SEPARATE * np.sum(errors**2, axis=0)] = np.inf
+    springs, place = np.char.startswith(names, "spring:"), {name: k for k, name in enumerate(names.tolist())}
+    for k in np.flatnonzero(springs).tolist():
+        bias = place.get(f"bias:{names[k].partition(':')[2]}", k)
+        strength, force = np.linalg.lstsq(rest[:, [k, bias]], r, rcond=SEPARATE)[0].tolist()
+        if bias != k and strength and np.isfinite(power[[k, bias]]).all():
+            for each in (rest, replaced):  # the position at which a spring has no force is not known
+                each[:, k] += force / strength * each[:, bias]
+            power[k], score[k] = rest[:, k] @ rest[:, k], rest[:, k] @ r
     sizes, statistics = -score / power, score**2 / power
-    probabilities = chi2.sf(statistics, 1)
+    probabilities = chi2.sf(statistics, 1 + springs)
     alarms = np.where(np.char.startswith(names, "load:"), OF_LOADS, ALARMS) / len(names)
     probabilities[(names == "filter") & (np.abs(sizes) < LEAST_FILTER)] = 1.0
     shown = [k for k in np.argsort(-statistics).tolist() if probabilities[k] < alarms[k]]
@@ -143,10 +153,11 @@ def _others(joints: Sequence[str], rows: Sequence[Rows], sd: Sequence[Array], dy
     clock = np.concatenate([stretched(each, dynamics) / s for each, s in zip(rows, sd)])
     parts = [-each.unmodelled / s[:, None] for each, s in zip(rows, sd)]
     slow = [part[:, -1] * (each.bin < SLOW) for each, part in zip(rows, parts)]
-    others, begin = {"clock": clock, "filter": np.concatenate(slow)}, 0
+    carried = np.concatenate([part[:, -2] for part in parts])
+    others, begin = {"clock": clock, "filter": np.concatenate(slow), "payload": carried}, 0
     for each, part in zip(rows, parts):
         own = slice(begin, begin := begin + len(part))
-        for name, column in zip(UNMODELLED[:-1], part.T):
+        for name, column in zip(UNMODELLED[:-2], part.T):
             others[f"{name}:{joints[each.joint]}"] = np.zeros(len(clock))
             others[f"{name}:{joints[each.joint]}"][own] = column
     return others

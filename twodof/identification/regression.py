@@ -33,9 +33,10 @@ LEAST_SAMPLES, LONGEST = 12, 400
 MOST_RESTING = 40  # means of samples of a stretch in which a joint may rest
 EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Edges of the frequency bins, in each of which noise has one variance, as fractions of the band."""
-UNMODELLED = ("drag", "load", "filter")
-"""Errors that are no parameters: damping by the square of the speed, friction in proportion to the load, and a low-pass
-filter, whose size is half the square of its time constant, s²."""
+UNMODELLED = ("drag", "load", "spring", "payload", "filter")
+"""Errors that are no parameters, or may not be free: damping by the square of the speed, friction in proportion to the
+load, a spring about the mean position, a payload, and a low-pass filter, whose size is half the square of its time
+constant, s². The last two are of all joints."""
 
 
 class Rows(NamedTuple):
@@ -53,7 +54,7 @@ class Rows(NamedTuple):
     tau: Array  # tau, tau_rate: recorded effort and its derivative, K
     tau_rate: Array
     offsets: Array  # derivative of the inverse dynamics with respect to positions, K × n
-    unmodelled: Array  # efforts of each of UNMODELLED of size 1, K × 3
+    unmodelled: Array  # efforts of each of UNMODELLED of size 1, K × 5
     bin: NDArray[np.int64]  # index of each row's frequency bin, K
     power: Array  # mean square of the recorded effort where each row weighs it, K
     about: tuple[Array, float]  # offsets, n, and delay of the efforts, s, at which the rows were linearised
@@ -145,7 +146,9 @@ def projector(
     late = _delayed(stretch, delay)
     rate = np.gradient(late, stretch.step, axis=0)
     joint = np.sign(stretch.v), stretch.v, stretch.a, np.ones_like(rate), late, rate
-    signals = np.dstack([*joint, *unmodelled(stretch, values, Y, G, varying)])
+    load = (Y + np.einsum("g,kgij->kij", values.gravity, G)) @ np.append(values.inertial[varying], 1.0)
+    carried = payload_efforts(parameters, values, stretch, with_offsets)
+    signals = np.dstack([*joint, *unmodelled(stretch, values, load, carried)])
     size, n = Y.shape[2], len(robot.joints)
 
     def rows_in(i: int, at: slice, basis: Array, bins: NDArray[np.int64]) -> Rows:
@@ -215,16 +218,31 @@ def position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wante
     return out
 
 
-def unmodelled(stretch: Stretch, values: Dynamics, Y: Array, G: Array, varying: NDArray[np.int64]) -> list[Array]:
-    """Return the efforts, N × n, of each of UNMODELLED of size 1; Y and G are those of ``regressors``.
+def payload_efforts(parameters: Parameters, values: Dynamics, stretch: Stretch, wanted: bool) -> Array:
+    """Return the efforts of a payload of 1 kg, N × n; 0 if they are not needed."""
+    robot, alone = parameters.robot, parameters.start.copy(float)
+    for field in ("mass", "com", "second", "payload_com"):
+        getattr(alone, field)[...] = 0.0
+    alone.payload[:] = 1.0
+    model = model_with(robot.model, parameters.dynamics(alone).inertial, values.gravity)
+    data, C = model.createData(), np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling
+    out = np.zeros_like(stretch.q)
+    q, v, a = (stretch.q + values.offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T
+    for k in range(len(q) if wanted else 0):
+        out[k] = C.T @ pin.rnea(model, data, q[k], v[k], a[k])
+    return out
+
+
+def unmodelled(stretch: Stretch, values: Dynamics, load: Array, carried: Array) -> list[Array]:
+    """Return the efforts, N × n, of each of UNMODELLED of size 1, by those of the links and of a payload of 1 kg.
 
     A filter of a time constant T changes a smooth effort by a delay and, in the second order, by T²/2 times its second
     derivative. Friction is not smooth.
     """
-    load = (Y + np.einsum("g,kgij->kij", values.gravity, G)) @ np.append(values.inertial[varying], 1.0)
     v, smooth = stretch.v, load + values.damping * stretch.v + values.armature * stretch.a
     bent = np.gradient(np.gradient(smooth, stretch.step, axis=0), stretch.step, axis=0)
-    return [each / values.gain for each in (v * np.abs(v), np.sign(v) * np.abs(load), bent)]
+    spring = stretch.q - stretch.q.mean(axis=0)
+    return [each / values.gain for each in (v * np.abs(v), np.sign(v) * np.abs(load), spring, carried, bent)]
 
 
 def residual(rows: Rows, values: Dynamics, delay: float) -> Array:
