@@ -511,7 +511,7 @@ def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
         ("anew", "the position of joint 'joint2' in"),
         ("wrapped", "jumps by a turn at"),
         ("degrees", "rad: they are probably in degrees"),
-        ("nan", "the position of joint 'joint2' at 7 s is not a number"),
+        ("nan", "the position of joint 'joint2' at 7 s is not a number: leave this joint state out"),
         ("huge", "the position of joint 'joint2' at 7 s is beyond 1e+100"),
         ("millinewton", "a factor of 1000"),
         ("millinewton of one", "the recorded efforts of joint 'joint2' are"),

@@ -235,7 +235,7 @@ def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
             k, i = bad[0]
             where = f"joint '{robot.joints[i]}' at {recording.t[k]:g} s"
             fault = f"beyond {MAX_VALUE:g}" if np.isfinite(values[k, i]) else "not a number"
-            raise InputError(f"'{name}': the {what} of {where} is {fault}")
+            raise InputError(f"'{name}': the {what} of {where} is {fault}: leave this joint state out")
     return q, tau
 
 
