@@ -53,7 +53,7 @@ REFUSED = (
     "of type 'floating'",
     "of type 'planar'",
     "of type 'spherical'",
-    "has no moving joint",
+    "no joint moves a link",
     "no mass or no inertia about its axis",
     "which does not exist",
     "not physical",
