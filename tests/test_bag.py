@@ -377,7 +377,9 @@ def test_a_path_that_is_not_a_bag_is_refused(tmp_path, content):
         path.mkdir()
     if content == "nonsense":
         (path / "metadata.yaml").write_text("hello: [")
-    with pytest.raises(BagError, match=r"cannot read the bag '.*bag'|there is no bag '.*bag'|bag' is not a bag(: it is|; make one)"):
+    with pytest.raises(
+        BagError, match=r"cannot read the bag '.*bag'|there is no bag '.*bag'|bag' is not a bag(: it is|; make one)"
+    ):
         twodof.read_bag(path)
 
 

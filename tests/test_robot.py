@@ -91,7 +91,10 @@ REFUSED = {
     "two joints of one name": (arm(link("x"), joint("elbow", "tip", "x")), "two joints .*'elbow'"),
     "no links": (robot(), "no links"),
     "3 million elements": (robot("<a/>" * 3_000_000), "the URDF has .* characters; at most 8388608 are supported"),
-    "no moving joint": (robot(link("base"), link("a"), joint("weld", "base", "a", kind="fixed")), "no joint moves a link"),
+    "no moving joint": (
+        robot(link("base"), link("a"), joint("weld", "base", "a", kind="fixed")),
+        "no joint moves a link",
+    ),
     "one link only": (robot(link("base")), "no joint moves a link"),
     "missing parent": (arm(elbow=joint("elbow", "ghost", "tip")), "'elbow'.* parent .*'ghost'"),
     "missing child": (arm(joint("wrist", "tip", "ghost")), "'wrist'.* child .*'ghost'"),
