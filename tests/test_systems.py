@@ -524,7 +524,7 @@ def test_names_in_bindings_that_do_not_exist_are_in_a_warning(
         system = loop(tmp_path / "loop.ssp", plant, pd, structure)
         caplog.clear()
         twodof.experiment(system)
-        text = "parameter bindings name variables that do not exist, and are ignored"
+        text = "parameter bindings name no variable that can be set, and are ignored"
         assert [record.getMessage() for record in caplog.records] == [f"'{system}': {text}: {line}"]
 
 

@@ -49,6 +49,12 @@ class Scalar:
         return read("0" if read is not str else "") if self.start is None else read(self.start)
 
     @property
+    def is_calculated(self) -> bool:
+        """True if an importer cannot give it a start value; FMI 2.0.4, section 2.2.7."""
+        starts = self.start is not None or self.causality in ("input", "parameter", "structuralParameter")
+        return not starts or self.variability == "constant"
+
+    @property
     def value_type(self) -> Type:
         """Type, with the range of whole numbers and of Float32; FMUs refuse other real numbers themselves."""
         if self.type not in WHOLE and self.type != "Float32":

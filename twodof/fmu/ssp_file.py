@@ -257,7 +257,7 @@ class _File:
                 converts = entry.get("suppressUnitConversion") not in TRUE
                 what = f"'{self._path}': the mapping of '{source}'"
                 yield parameter._replace(name=target, converts=converts, map=transformation(entry, what))
-            else:
+            elif source:  # tools write entries without a source for all variables
                 ignored.append(source)
 
     def _check_once(self, names: list[str], what: str) -> None:

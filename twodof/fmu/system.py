@@ -40,7 +40,7 @@ class System(Fmu):
         recorded: name of the component that is the robot.
         nodes: the component's variable, or the system's connector, for each of ``variables``.
         bound: start values of components' variables from parameter bindings, also of connectors that pass them.
-        ignored: names in parameter bindings that no variable or connector has.
+        ignored: names in parameter bindings that no variable or connector has, or only one that its FMU calculates.
     """
 
     recorded: str = ""
@@ -65,7 +65,7 @@ class System(Fmu):
         if self.ignored:
             first = ", ".join(f"{name:.80}" for name in self.ignored[:MOST_NAMED])
             more = f" and {len(self.ignored) - MOST_NAMED} more" * (len(self.ignored) > MOST_NAMED)
-            lines.append(f"parameter bindings name variables that do not exist, and are ignored: {first}{more}")
+            lines.append(f"parameter bindings name no variable that can be set, and are ignored: {first}{more}")
         for element, fmu in self.components.items():
             for names in fmu.groups("input").values():
                 left = [f"{element}.{name}" for name in names if Node(element, name) not in ends]
@@ -200,7 +200,7 @@ def _driving(links: list[Link], robot: str) -> set[str]:
 
 
 def _bound(path: Path, wiring: Wiring) -> tuple[dict[Node, Start], list[str]]:
-    """Return start values from parameter bindings, and unknown names; outer systems take precedence over inner ones.
+    """Return start values from parameter bindings, and names without effect; outer systems precede inner ones.
 
     A connector with a value passes it to the connected variables; without one, they keep their own.
     """
@@ -211,6 +211,8 @@ def _bound(path: Path, wiring: Wiring) -> tuple[dict[Node, Start], list[str]]:
             name = f"{element.name}.{parameter.name}" if element.name else parameter.name
             if (node := wiring.find(name)) is None:  # the standard ignores such parameters
                 ignored.append(f"{name} (name its elements: {name}[1])" if wiring.find(f"{name}[1]") else name)
+            elif (scalar := wiring.scalar(node)) is not None and scalar.is_calculated:
+                ignored.append(f"{name} ({scalar.causality})")
             else:
                 starts[node] = _value(path, wiring, node, parameter)
     passed = wiring.passed({node: value for node, value in starts.items() if not isinstance(value, str)}).items()
