@@ -117,7 +117,7 @@ def test_commands_and_programs_run_in_the_order_of_the_text(page, tmp_path):
     assert done.returncode == 0, done.stderr
     warnings = [line for line in done.stderr.splitlines() if line.startswith("WARNING")]
     if page.name == "systems.md":  # the text says so
-        assert "'mine.ssp': parameter bindings name variables that do not exist" in warnings.pop(0)
+        assert "'mine.ssp': parameter bindings name no variable that can be set" in warnings.pop(0)
     assert not warnings
     if page.name == "README.md":  # which shows what its commands print; sizes depend on the compiler
         shown = [line for block in blocks(page.read_text("utf-8")) if block.language == "text" for line in block.lines]
