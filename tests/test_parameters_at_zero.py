@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import re
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import fmpy
 import pytest
 from native_models import from_urdf, last_link, urdf_path
 from tools import needs
+
+from twodof.export.compiler import FLAGS, TARGETS, ZIG
 
 ROBOTS = (
     "twodof",
@@ -54,10 +56,11 @@ int main(void)
         start[i] = V_START + i + 1;
         state[i] = 0.3;
     }
+    fmi2DoStepTYPE *volatile step = fmi2DoStep; /* a function of its own, in which instructions are counted */
     int status = fmi2SetReal(arm, start, N_JOINTS, state) | fmi2SetupExperiment(arm, 0, 0, 0, 0, 0)
                  | fmi2EnterInitializationMode(arm) | fmi2ExitInitializationMode(arm);
     for (int k = 0; k < 200; k++) {
-        status |= fmi2DoStep(arm, k * 0.01, 0.01, 1) | fmi2GetReal(arm, vr, 2 * N_JOINTS, state);
+        status |= step(arm, k * 0.01, 0.01, 1) | fmi2GetReal(arm, vr, 2 * N_JOINTS, state);
         for (int i = 0; i < 2 * N_JOINTS; i++)
             printf("%a\\n", state[i]);
     }
@@ -66,14 +69,14 @@ int main(void)
 """
 
 
-def compiled(files: dict[str, bytes], folder: Path) -> Path:
+def compiled(files: dict[str, bytes], folder: Path, compiler: Sequence[str], flags: Sequence[str]) -> Path:
     folder.mkdir()
     for name, content in files.items():
         (folder / name).write_bytes(content)
     (folder / "host.c").write_text(HOST)
     (folder / "stub.c").write_text("void twodof_differentiate(void) {}")  # a step needs no derivatives
-    flags = ["-std=c99", "-O1", "-ffp-contract=off", f"-I{Path(fmpy.__file__).parent / 'c-code'}"]
-    subprocess.run([needs("gcc"), *flags, "-o", "host", "host.c", "stub.c", "-lm"], cwd=folder, check=True)
+    flags = [*flags, f"-I{Path(fmpy.__file__).parent / 'c-code'}"]
+    subprocess.run([*compiler, *flags, "-o", "host", "host.c", "stub.c", "-lm"], cwd=folder, check=True)
     return folder / "host"
 
 
@@ -86,12 +89,37 @@ def without(files: dict[str, bytes]) -> dict[str, bytes]:
     return files | {name: text.encode() for name, text in removed.items()}
 
 
+def hosts(name: str, control: str, folder: Path, compiler: Sequence[str], flags: Sequence[str]) -> list[Path]:
+    """Programs that run a robot: with the parameters at 0, and without them."""
+    text = re.sub('friction="[^"]*"', 'friction="0"', urdf_path(name).read_text())
+    frame, axes = ("EndEffector", "xy") if name == "twodof" else (last_link(name), "xyz")
+    files = from_urdf(text, frame, axes, control).sources()
+    both = enumerate((files, without(files)))
+    return [compiled(sources, folder / f"{Path(name).stem}{k}", compiler, flags) for k, sources in both]
+
+
 @pytest.mark.parametrize("control", ["task", "joint", "effort"])
 def test_parameters_at_zero_change_no_bit(control: str, length: Callable[[int, int], int], tmp_path: Path) -> None:
     for name in ROBOTS[: length(len(ROBOTS), 2)]:
-        text = re.sub('friction="[^"]*"', 'friction="0"', urdf_path(name).read_text())
-        frame, axes = ("EndEffector", "xy") if name == "twodof" else (last_link(name), "xyz")
-        files = from_urdf(text, frame, axes, control).sources()
-        hosts = [compiled(files, tmp_path / f"{Path(name).stem}{k}") for k, files in enumerate((files, without(files)))]
-        rows, plain = (subprocess.check_output([host]).split() for host in hosts)
+        both = hosts(name, control, tmp_path, [needs("gcc")], ["-std=c99", "-O1", "-ffp-contract=off"])
+        rows, plain = (subprocess.check_output([host]).split() for host in both)
         assert rows == plain and len(set(rows)) > 300, name
+
+
+def instructions(host: Path) -> int:
+    """Instructions of all communication steps, as Callgrind counts them."""
+    count = [needs("valgrind"), "--tool=callgrind", "--callgrind-out-file=/dev/null", "--toggle-collect=fmi2DoStep"]
+    done = subprocess.run([*count, host], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=True)
+    return int(re.findall(r"Collected : (\d+)", done.stderr)[0])
+
+
+@pytest.mark.parametrize("control", ["task", "joint", "effort"])
+def test_parameters_at_zero_cost_few_instructions(
+    control: str, length: Callable[[int, int], int], tmp_path: Path
+) -> None:
+    needs("valgrind")
+    compiler = [*ZIG, *TARGETS["linux64"]]
+    for name in ROBOTS[: length(len(ROBOTS), 2)]:
+        steps, plain = map(instructions, hosts(name, control, tmp_path, compiler, FLAGS[:6]))
+        print(f"{name}, {control}: {steps / plain:.4f}")
+        assert plain > 1e6 and steps / plain < (1.04 if (name, control) == ("twodof", "effort") else 1.03), name

@@ -150,9 +150,9 @@ static int find_excess(const double value[N_VARIABLES], const JointPosition join
         if (!accelerates)
             a[i] = 0.0;
         excess[i] = value[TAU_EXT + i] - value[DAMPING + i] * v[i];
-        if (slip)
-            excess[i] -= value[FRICTION + i] * slip[i];
     }
+    for (int i = 0; slip && i < N_JOINTS; i++)
+        excess[i] -= value[FRICTION + i] * slip[i];
     if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
         effort_of_force(joint, force, further);
         for (int i = 0; i < N_JOINTS; i++)
