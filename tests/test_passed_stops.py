@@ -232,9 +232,10 @@ def test_runge_kutta_sees_a_short_stop(fmus, importer, fmi, h):
 
 
 @pytest.mark.parametrize("h", [1e-3, 1e-2])
-def test_pathsim_sees_a_short_stop(fmus, h):
+def test_pathsim_sees_a_short_stop(fmus, h, tmp_path, monkeypatch):
     """1e-2 s is PathSim's default step; inputs without a connection would be 0."""
     needs("pathsim")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # PathSim does not remove the unpacked FMU
     from pathsim import Connection, Simulation
     from pathsim.blocks import Constant
     from pathsim.solvers import RKDP87
