@@ -85,7 +85,7 @@ def main(seeds: int) -> None:
         held = 100.0 * np.mean(np.abs(column) < 1.96)
         print(f"| {name} | {value:g} | {held:.1f} % | {column.mean():+.2f} |")
     seconds = (time.process_time() - begin) / seeds
-    print(f"all: {100.0 * np.mean(np.abs(z) < 1.96):.1f} %; {flagged} of {seeds} said to be unexplained")
+    print(f"all: {100.0 * np.mean(np.abs(z) < 1.96):.1f} %; {flagged} of {seeds} are not explained by the model")
     print(f"{seconds:.2f} s of processor time a fit, the writing of the bag included")
 
 
