@@ -346,6 +346,14 @@ def test_a_limit_cycle_has_its_frequency_by_its_crossings() -> None:
     assert motion_of(t, triangle[:, None], 0.5)[0] == "oscillating"
 
 
+def test_a_motion_with_one_jolt_is_no_oscillation() -> None:
+    """Its error crosses its mean three times, and does not repeat."""
+    t = np.linspace(0.0, 5.0, 501)
+    y = 0.3 - 0.02 * t + 0.05 * np.exp(-(((t - 3.9) / 0.05) ** 2))
+    assert ringing(t, y) is None
+    assert motion_of(t, y[:, None], 0.14)[0] == "moving"
+
+
 @pytest.mark.parametrize(
     ("rate", "motion"), [(-3.0, "steady"), (0.0, "oscillating"), (0.8, "diverging")], ids=["decays", "lasts", "grows"]
 )
