@@ -435,7 +435,7 @@ def test_strong_friction_on_light_joints_has_a_reference(
         robots_folder() / urdf, frame=frame, control=control, native=True, meshes=False, reference=True
     )
     path = twodof.build_fmu(tmp_path / "arm.fmu", options)
-    assert not [record for record in caplog.records if record.levelno > logging.INFO]  # a library is compiled if no cache has it
+    assert not [record for record in caplog.records if record.levelno > logging.INFO]
     (rest,) = (reference for reference in references_of(load_any_fmu(path)) if reference.name == "rest")
     assert rest.tolerance == 1e-8
     assert {row.outcome for row in rows(path).values()} == {"passed"}
