@@ -8,10 +8,11 @@ from contextlib import ExitStack
 
 import browser
 import pytest
+from sinks import resident
 from websockets.sync.client import connect
 
 from twodof.errors import PageError
-from twodof.pages.serving import LARGEST, MOST_CONNECTIONS, Server
+from twodof.pages.serving import LARGEST, MOST_CONNECTIONS, Connection, Server
 
 
 def names_of(*names: str) -> list[str]:
@@ -148,3 +149,40 @@ def test_a_page_on_all_addresses_is_opened_as_printed(host):
         assert f"//{host}:" not in server.url and "[::]" not in server.url
         with urllib.request.urlopen(server.url, timeout=60) as answer:
             assert answer.read() == b"page"
+
+
+@pytest.mark.parametrize(
+    ("begin", "flood"),
+    [
+        pytest.param(b"", (b"\x89\xfd\0\0\0\0" + b"x" * 125) * 500, id="pings"),
+        pytest.param(b"\x01\x80\0\0\0\0", b"\0\x80\0\0\0\0" * 10_000, id="empty fragments"),
+    ],
+)
+def test_a_websocket_that_floods_is_ended(begin: bytes, flood: bytes) -> None:
+    """Answers to its pings, and fragments of a message without end, would fill the memory."""
+
+    async def talk(connection: Connection) -> None:
+        async for _ in connection:
+            pass
+
+    with Server(None, port=0, talk=talk) as server, browser.connected(server.url, "127.0.0.1") as one:
+        upgrade = "".join(f"{name}: {value}\r\n" for name, value in (("Host", "localhost"), *browser.UPGRADE))
+        one.sendall(f"GET / HTTP/1.1\r\n{upgrade}\r\n".encode())
+        assert one.recv(100).split()[1] == b"101"
+        one.sendall(begin)
+        with pytest.raises(ConnectionError):
+            for _ in range(300):
+                one.sendall(flood)
+
+
+def test_slow_browsers_take_no_memory() -> None:
+    page = os.urandom(8 * 1024**2)
+    with Server(page, port=0) as server, ExitStack() as slow:
+        before = resident()
+        for _ in range(MOST_CONNECTIONS):
+            one = slow.enter_context(browser.connected(server.url, "127.0.0.1"))
+            one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert one.recv(10)
+        with urllib.request.urlopen(server.url, timeout=60) as answer:
+            assert answer.read() == page
+        assert resident() - before < 100 * 1024**2

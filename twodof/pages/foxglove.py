@@ -1,8 +1,8 @@
 """Serve a run to Foxglove without ROS: the bag's messages over a WebSocket, and gains as parameters.
 
 Foxglove's SDK answers any website and user. Therefore it listens on a random address of the loopback network, where
-the kernel drops all segments without the signature of this process. A relay of ``serving``, which checks the origin
-and the user of requests, answers Foxglove.
+the kernel drops all segments without the signature of this process. The server of ``serving``, which checks the origin
+and the user of requests, answers Foxglove and relays the messages.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from ..simulation.input_values import Value, check_going_on, resolve
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
 from ..version import needing
-from .serving import HOST, Server, lock_port, relay
+from .relay import lock_port, relay
+from .serving import HOST, Server
 
 with needing(PublishError, "serve Foxglove", "foxglove"):
     from foxglove import Channel, Context, Parameter, Schema, start_server

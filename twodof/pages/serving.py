@@ -14,13 +14,11 @@ import secrets
 import socket
 import stat
 import struct
-import sys
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from itertools import count, permutations
 from pathlib import Path
 from threading import Event, Thread
 
@@ -28,12 +26,12 @@ from ..errors import PageError
 from ..version import needing
 
 with needing(PageError, "show a page", "view"):
-    from websockets.asyncio.client import connect
-    from websockets.asyncio.connection import Connection as Peer
     from websockets.asyncio.server import ServerConnection, serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
+    from websockets.frames import DATA_OPCODES, Frame
     from websockets.http11 import Request, Response
+    from websockets.protocol import Event as Received
     from websockets.protocol import State
     from websockets.typing import Subprotocol
 
@@ -42,8 +40,8 @@ SLOW = 60.0  # s for the transfer of a page to a browser
 CLOSING = 1.0  # s
 LARGEST = 64 * 1024  # bytes of a message from a browser, or of its requests before a websocket is open
 MOST_CONNECTIONS = 64
-BURST, PAUSE = 20, 0.1  # messages that a relay takes from a client between two pauses, and a pause, s
-TCP_MD5SIG_EXT = 32  # on Linux, from kernel 4.13
+MOST_FRAGMENTS = 1000  # fragments of a message from a browser
+PIECE = 64 * 1024  # bytes of a page that wait for a slow browser
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 REFUSED = "open this page at the printed address; the argument host gives it another address or name\n"
 OTHER_USER = "only programs of the user who runs twodof are answered\n"
@@ -140,7 +138,7 @@ class Server:
             with suppress(ConnectionClosed):
                 await self._talk(connection)
 
-    def _answer(self, connection: Connection, request: Request) -> Response | None:
+    async def _answer(self, connection: Connection, request: Request) -> Response | None:
         if not _is_own(request, self._host, self._address, self._origins):
             return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
         if self._private and _is_of_another_user(connection):
@@ -155,16 +153,30 @@ class Server:
             return None
         if path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "there is one page, /\n")
-        headers = Headers(HEADERS)
-        headers["Content-Length"] = str(len(self._page))
-        return Response(HTTPStatus.OK.value, "OK", headers, self._page)
+        await self._send_page(self._page, connection)
+        return None
+
+    async def _send_page(self, page: bytes, connection: Connection) -> None:
+        """Send the page in pieces, so that a slow browser takes no memory, and wait for the end of the connection."""
+        headers, pieces = Headers(HEADERS), memoryview(page)
+        headers["Content-Length"] = str(len(page))
+        connection.transport.write(Response(HTTPStatus.OK.value, "OK", headers).serialize())
+        for k in range(0, len(page), PIECE):
+            await connection.drain()
+            if connection.transport.is_closing():
+                return
+            connection.transport.write(pieces[k : k + PIECE])
+        connection.transport.write_eof()
+        await connection.wait_closed()
 
 
 class _Answering(ServerConnection):
     """A connection that answers requests which the websockets library would drop."""
 
     _asked = False
-    _size = 0
+    _size = 0  # bytes of requests
+    _answers = 0  # bytes of answers to pings that wait for a slow client
+    _fragments = 0  # of the message that is being received
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Open a connection; if there are too many, end the oldest one that is not yet an open websocket."""
@@ -180,10 +192,24 @@ class _Answering(ServerConnection):
             self.transport.abort()
         elif self._asked or b"GET ".startswith(data[:4]):
             self._asked = True
+            waiting = self.transport.get_write_buffer_size()
             super().data_received(data)
+            grown = self.transport.get_write_buffer_size() - waiting
+            self._answers = self._answers + grown if waiting else grown
+            if self.state is State.OPEN and self._answers > LARGEST:
+                self.transport.abort()
         else:
             self.transport.write(NOT_GET)
             self.transport.close()
+
+    def process_event(self, event: Received) -> None:
+        """Receive a frame; end a connection whose message has too many fragments, which may be empty."""
+        if isinstance(event, Frame) and event.opcode in DATA_OPCODES:
+            self._fragments = 0 if event.fin else self._fragments + 1
+            if self._fragments > MOST_FRAGMENTS:
+                self.transport.abort()
+                return
+        super().process_event(event)
 
 
 def user_token() -> str:
@@ -200,62 +226,6 @@ def user_token() -> str:
         if own and not state.st_mode & 0o077 and re.fullmatch(r"[\w-]{43}", kept, re.ASCII):
             return kept
     return secrets.token_urlsafe(32)
-
-
-def lock_port(address: tuple[str, int], key: bytes) -> bool:
-    """Let only ``relay`` with this key connect to a port on which this process listens; return whether Linux can.
-
-    Linux then drops all TCP segments without the signature of RFC 2385, also of accepted connections.
-    """
-    signed = []
-    for number in map(int, os.listdir("/proc/self/fd") * 2 if sys.platform == "linux" else ()):  # the listener first
-        with suppress(OSError):  # closed meanwhile
-            if stat.S_ISSOCK(os.fstat(number).st_mode):
-                with socket.socket(fileno=os.dup(number)) as one:
-                    if one.family == socket.AF_INET and one.getsockname() == address:
-                        signed.append(_sign(one, key))
-    return all(signed) and bool(signed)
-
-
-def _sign(one: socket.socket, key: bytes) -> bool:
-    """Make a socket sign its segments and drop unsigned ones; return False if it cannot. Source: linux/tcp.h."""
-    any_address = struct.pack("=H126x", socket.AF_INET)
-    try:
-        one.setsockopt(
-            socket.IPPROTO_TCP, TCP_MD5SIG_EXT, any_address + struct.pack("=BBHi80s", 1, 0, len(key), 0, key)
-        )
-    except OSError:
-        return False
-    return True
-
-
-async def relay(address: tuple[str, int], key: bytes, connection: Connection) -> None:
-    """Pass messages between a websocket and a server of this process, until one of them closes.
-
-    Args:
-        key: key with which ``lock_port`` has locked it; b"": not locked.
-    """
-    protocols = [connection.subprotocol] if connection.subprotocol else None
-    inner = socket.socket()
-    if key:
-        _sign(inner, key)
-    inner.connect(address)  # of this process: it does not wait
-    url, taken = f"ws://{address[0]}:{address[1]}", count(1)
-    async with connect(
-        url, sock=inner, subprotocols=protocols, compression=None, max_size=None, proxy=None, logger=_silent
-    ) as other:
-
-        async def pump(source: Peer, sink: Peer) -> None:
-            with suppress(ConnectionClosed):
-                async for message in source:
-                    await sink.send(message)
-                    if sink is other and next(taken) % BURST == 0:  # a flood would delay the run
-                        await asyncio.sleep(PAUSE)
-
-        pumps = [asyncio.ensure_future(pump(*ends)) for ends in permutations((connection, other))]
-        await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
-        for one in pumps:
-            one.cancel()
 
 
 def _is_own(request: Request, host: str, address: str, others: Collection[str] = ()) -> bool:
