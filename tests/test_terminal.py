@@ -1,6 +1,8 @@
 """Unusual command lines and streams get one line each; names contain no terminal commands."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -107,3 +109,16 @@ def test_a_line_break_in_a_name_makes_no_line(native_path, tmp_path):
     done = run("info", str(path), cwd=tmp_path)
     assert done.returncode == 0 and "TwoDof\\nverdict  reached" in done.stdout
     assert not any(line.startswith("verdict") for line in done.stdout.splitlines())
+
+
+def test_a_line_break_in_a_name_begins_no_line(tmp_path):
+    """The name would look like a message of this program."""
+    text = data_file("urdf", "2dof.urdf").read_text("utf-8")
+    text = re.sub('lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"', text)
+    text = text.replace("joint1", "a&#10;twodof: error: b")
+    (tmp_path / "robot.urdf").write_text(text, "utf-8")
+    done = run("build", "robot.urdf", cwd=tmp_path)
+    assert r"joints 'a\ntwodof: error: b'" in done.stderr
+    assert {line.partition(" ")[0] for line in done.stderr.splitlines()} == {"WARNING:"}
+    printed = run("info", "robot.fmu", "--json", cwd=tmp_path).stdout
+    assert json.loads(printed)["joints"][0] == "a\ntwodof: error: b"

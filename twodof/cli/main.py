@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CommandLineError as error:
         return _fail(str(error), 2)
     except TwoDofError as error:
-        return _fail(in_options(str(error)))
+        return _fail(in_options(" ".join(str(error).split())))
     except BrokenPipeError:  # the reader of the output has left
         _silence()
         return 1

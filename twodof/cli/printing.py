@@ -39,11 +39,11 @@ def in_options(text: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Return a text with control and bidirectional characters as escapes.
+    """Return a text with control and bidirectional characters, and line breaks, as escapes.
 
-    Names in untrusted files can then neither control the terminal nor reverse a line.
+    Names in untrusted files can then neither control the terminal, nor reverse a line, nor look like another line.
     """
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def quote(path: Path) -> str:
@@ -52,8 +52,9 @@ def quote(path: Path) -> str:
 
 
 def say(text: str = "", *, error: bool = False) -> None:
-    """Print a line to stdout, or an error to stderr; every verb prints by this function."""
-    print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
+    """Print a line to stdout, or an error to stderr; empty lines may precede it. Every verb prints by this."""
+    line = text.lstrip("\n")
+    print("\n" * (len(text) - len(line)) + plain(line), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = "") -> None:
@@ -69,7 +70,7 @@ def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.lju
 
 def _cell(text: str) -> str:
     shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}… ({len(text)} characters)"
-    return plain(shown).replace("\n", "\\n")
+    return plain(shown)
 
 
 def written(path: Path, *facts: str) -> str:
@@ -90,7 +91,8 @@ def print_next(*commands: str) -> None:
     program = _program()
     lines = [re.sub("^twodof ", lambda _: f"{program} ", command) for command in shown]
     if lines:
-        say("\n  ".join(["\nnext", *lines]))
+        for line in ("\nnext", *(f"  {line}" for line in lines)):
+            say(line)
     if len(shown) < len(here):
         say(f"\nto plot and view: {install('view')}")
 
@@ -135,4 +137,4 @@ def busy(what: str, *, silent: bool = False) -> Iterator[None]:
 def print_json(**facts: object) -> None:
     """Print facts for another program, in SI units; null for numbers that are not finite."""
     finite = json.loads(json.dumps(facts), parse_constant=lambda _: None)
-    say(json.dumps(finite, indent=2))
+    print(json.dumps(finite, indent=2), flush=True)  # in ASCII
