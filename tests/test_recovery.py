@@ -46,8 +46,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 
 import twodof
 from twodof.bag import recovery
+from twodof.bag.storage import profile
 from twodof.cli.main import main
 from twodof.errors import BagError
+from twodof.ros.messages import LATCHED
 
 PAGE = 4096  # bytes, of SQLite
 
@@ -313,6 +315,19 @@ def test_no_more_profiles_are_read_than_take_no_time(tmp_path, monkeypatch):
     monkeypatch.setattr("twodof.bag.recovery.MAX_PROFILES", 2000)
     assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
     assert read == profiles[:3]
+
+
+def test_no_more_profiles_are_written_than_readers_parse_in_time(tmp_path, monkeypatch):
+    """Many topics have one long profile, which metadata.yaml states for each of them."""
+    (tmp_path / "bag").mkdir()
+    text = profile(LATCHED)
+    topics = b"".join(channel(i, f"/t{i}", text) + message(bytes(4), number=i) for i in range(3))
+    (tmp_path / "bag/bag.mcap").write_bytes(HEADER + SCHEMA + topics + FOOTER)
+    monkeypatch.setattr("twodof.bag.recovery.MAX_WRITTEN_PROFILES", 2 * len(text), raising=False)
+    twodof.recover(tmp_path / "bag")
+    with Reader(tmp_path / "bag") as reader:
+        known = [it.ext for it in reader.connections if isinstance(it.ext, ConnectionExtRosbag2)]
+    assert [len(it.offered_qos_profiles) for it in known] == [1, 1, 0]
 
 
 MERGED = "- &a0 {history: 1}\n" + "".join(f"- &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 20))

@@ -93,6 +93,7 @@ MAX_COMPARED_SIZE = 256 * MIB  # joint states of several bags in one figure; an 
 MAX_LOOSE = 16 * MIB  # records outside chunks that are read at a time, apart from one large record
 MAX_VALUE = 1e100  # largest value of a sample that is judged, fitted or drawn: squares of much larger ones overflow
 MAX_PROFILES = 64 * KIB  # different QoS profiles of all topics, in YAML, which is slow to parse
+MAX_WRITTEN_PROFILES = 256 * KIB  # QoS profiles of all topics as metadata.yaml states them, which readers parse too
 MAX_DEFINITION = 64 * KIB  # a message type
 MAX_DEFINITIONS = 256 * KIB  # all message types without a stored hash; hashing 64 KiB takes a second
 

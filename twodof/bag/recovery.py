@@ -29,6 +29,7 @@ from ..bounds import (
     MAX_PROVENANCE,
     MAX_PROVENANCES,
     MAX_TOPICS,
+    MAX_WRITTEN_PROFILES,
     MIB,
 )
 from ..errors import BagError, no_such
@@ -36,7 +37,7 @@ from ..files import lock, read_file, sync
 from . import provenance
 from .contents import read_messages, stated_count, storage_files
 from .records import Channel, DamageError, ReadBudget
-from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, McapStorage, check_path
+from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, McapStorage, check_path, profile
 from .summary import read_summaries
 
 UNUSUAL = re.compile(r"[&*<]|\w{41}")  # YAML's references, which can grow without end, and no number of a profile
@@ -245,6 +246,7 @@ class _Topics:
         self._profiles: dict[str, list[Qos]] = {}
         self._hashes: dict[tuple[str, str], str] = {}
         self._yaml = self._defined = 0
+        self._room = MAX_WRITTEN_PROFILES
 
     def connection(self, channel: Channel) -> Connection:
         if channel not in self._connections:
@@ -259,14 +261,15 @@ class _Topics:
         return self._connections[channel]
 
     def _qos(self, text: str) -> list[Qos]:
-        """Return the QoS profiles of a topic; none if they are invalid, so that players use defaults."""
+        """Return the QoS profiles of a topic; none if they are invalid or too long, so that players use defaults."""
         if text not in self._profiles:
             self._profiles[text] = []
             self._yaml += len(text)
             if self._yaml < MAX_PROFILES and not UNUSUAL.search(text):
                 with suppress(ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError):
                     self._profiles[text] = parse_qos(text)
-        return self._profiles[text]
+        self._room -= sum(len(profile(qos)) for qos in self._profiles[text])  # of each topic: they are written for each
+        return self._profiles[text] if self._room >= 0 else []
 
     def _hash(self, channel: Channel) -> str:
         """Return ROS 2's hash of a type, computed from the definition in the file."""
