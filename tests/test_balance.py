@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +217,16 @@ def test_a_gain_that_changed_is_the_present_one_in_a_bag_without_a_verdict(tmp_p
     )  # fmt: skip
     run = twodof.read_bag(tmp_path / "bag")
     assert "Kp = 0: the controller" in run._judged(run.setup, run.x, run.target if run.x.size else run.x).lines[0]
+
+
+def test_a_bag_of_an_impossible_gravity_has_a_verdict(tmp_path: Path) -> None:
+    """Rounding makes its mass matrix singular, and its error has no known parts."""
+    bag = tmp_path / "bag"
+    twodof.simulate(fmu_of("arm", "task"), twodof.Bag(bag), settings={"gravity": (0.0, -9.81, 0.0)}, stop_time=1.0)
+    run = json.loads((bag / "run.json").read_text())
+    run["start_values"]["gravity[1]"] = 1e30
+    (bag / "run.json").write_text(json.dumps({**run, "verdict": None}))
+    assert twodof.read_bag(bag).verdict.outcome == "not reached"
 
 
 def test_a_joint_without_limits_may_turn_further_than_once() -> None:

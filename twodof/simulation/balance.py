@@ -74,9 +74,12 @@ def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
     rows = {name: np.array([of == name for of in owner]) for name in missed}
     static = dict[str, float]()
     wholes, parts = dict.fromkeys(missed, 0.0), {name: defaultdict[Key, float](float) for name in missed}
-    for sample in _late(judge):
-        balance = _Balance(judge, models, *sample)
-        terms = [*balance.terms()]
+    balances = [_Balance(judge, models, *sample) for sample in _late(judge)]
+    try:
+        every = [[*balance.terms()] for balance in balances]
+    except np.linalg.LinAlgError:  # rounding makes a mass matrix singular, as under a gravity of 1e30 m/s²
+        return UNKNOWN
+    for balance, terms in zip(balances, every):
         for name, own in rows.items():
             wholes[name] += float(balance.e[own] @ balance.e[own])
             for key, term in terms:
