@@ -35,7 +35,7 @@ def add(build: Parser) -> None:
     option("--mesh-dir", type=Path, metavar="FOLDER", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="omit the URDF's meshes from the FMU")
     text = "controlled link (EndEffector, or the last link, if there is only one)"
-    option("--frame", type=not_empty, help=text, completer=links)
+    option("--frame", type=not_empty, metavar="LINK", help=text, completer=links)
     add_options(build, "--lock")
     option("--axes", help="task axes, letters of xyz (xy for the default arm, else xyz)")
     text = "gravity, m/s2 in the root frame (0 -9.81 0 for the default arm, else 0 0 -9.81)"

@@ -1,4 +1,4 @@
-"""Verb page: write a robot as one HTML file that runs."""
+"""Verb page: write a running robot as one HTML file."""
 
 import argparse
 

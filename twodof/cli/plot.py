@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def add(plot: Parser) -> None:
     plot.description = (
-        "Draw joint positions, velocities and efforts, the end effector's path and its error; of a"
+        "Draw joint positions, velocities and efforts, the end effector's path and its error; for a"
         " sweep, each metric over the variables."
     )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="bags to draw; several are compared")

@@ -8,7 +8,7 @@ from .printing import print_next, print_table, quote, say
 
 
 def add(recover: Parser) -> None:
-    recover.description = "Repair a bag whose writer died, so that every reader opens it."
+    recover.description = "Repair a bag whose writer died, so that every reader can open it."
     recover.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
 
 

@@ -17,7 +17,7 @@ def add(view: Parser) -> None:
     text = "write a page (.html), a film (.mp4, .webp, .gif) or a picture (.png) instead; - is the standard output"
     view.add_argument("--export", type=output_file, metavar="FILE", help=text)
     add_robot_options(view)
-    view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of the packages or meshes of the URDF")
+    view.add_argument("--mesh-dir", type=Path, metavar="FOLDER", help="folder of the URDF's packages or meshes")
     view.add_argument("--fmu", metavar="FMU", help="FMU that contains the robot's meshes")
     add_options(view, *OF_A_PAGE)
 
