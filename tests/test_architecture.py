@@ -156,9 +156,9 @@ VERBS = re.findall(
     r"\w+",
     """
     Add Advance Append Apply Bound Build Change Check Close Compare Compile Complete Compose Confine Convert Count
-    Assert Create Decode Deserialise Determine Discard Do Draw End Execute Exit Expand Find Fit Flush Format Free Import
-    Install Instantiate Integrate Join Judge Keep Let Limit Load Lock Make Mark Match Measure Merge Move Name Note
-    Open Pack Parse Pass Prevent Print Publish Put Queue Quote Raise Read Receive Refuse Register Reject Remove
+    Assert Create Decode Deserialise Design Determine Discard Do Draw End Execute Exit Expand Find Fit Flush Format Free
+    Import Install Instantiate Integrate Join Judge Keep Let Limit Load Lock Make Mark Match Measure Merge Move Name
+    Note Open Pack Parse Pass Prevent Print Publish Put Queue Quote Raise Read Receive Refuse Register Reject Remove
     Replace Replay Report Reset Resolve Restart Restore Restrict Return Rotate Round Run Sample Save Say Send Set
     Show Simulate Split Start Stay Step Stop Store Subtract Take Transform Wait Warn Write Yield
     """,

@@ -130,7 +130,7 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
 
 
 def _turns(every: NDArray[np.uint8], turn: Sequence[int], length: int) -> Rows:
-    """Return periodic records, one row for each period of a length; ``turn`` has the records' offsets in a period."""
+    """Return records that repeat every ``length`` bytes, one row for each period; ``turn`` has their offsets in it."""
     rows = every[: len(every) // length * length].reshape(-1, length)
     heads = np.concatenate([np.arange(offset, offset + HEAD.size + 2) for offset in turn])
     count, ahead = 1, 16

@@ -114,9 +114,9 @@ def has_joint_commands(recording: Recording) -> bool:
 def joint_commands(
     path: Path, recording: Recording
 ) -> tuple[tuple[str, str, str], list[tuple[float, Mapping[str, Value]]]]:
-    """Return an FMU's URDF, frame and axes, and all its values at each of a bag's commands from a time, s, on.
+    """Return an FMU's URDF, frame and axes, and the times, s, of commands in a bag with all values of the FMU.
 
-    The first time is that at which each joint has had a command.
+    Commands before the time at which each joint has had one are left out.
 
     Raises:
         InputError: the bag has no such commands.

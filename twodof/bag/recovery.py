@@ -225,7 +225,7 @@ def _copy_meshes(folder: Path, new: Path, robots: Sequence[str], damage: list[st
 
 
 def _provenances(folder: Path, robots: Iterable[str], damage: list[str]) -> dict[str, bytes]:
-    """Return the provenance files of robots by name; add those for which there is no room to the damage."""
+    """Return the provenance files of robots by name; report those for which there is no room as damage."""
     kept: dict[str, bytes] = {}
     for name in map(provenance.file_of, robots):
         with suppress(OSError):

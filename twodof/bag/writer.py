@@ -78,7 +78,7 @@ class Bag(Sink):
         self.count = 0
 
     def of(self, namespace: str) -> Bag:
-        """Return a sink for one of several robots, whose topics in the same bag have a namespace of ROS 2."""
+        """Return a sink for one of several robots in this bag; a ROS 2 namespace contains its topics."""
         check_name("namespace", namespace)
         robot = copy(self)
         robot.namespace = namespace.strip("/")
@@ -130,11 +130,11 @@ class Bag(Sink):
 
     @property
     def takes_rows(self) -> bool:
-        """True if outputs are enough, and no derived class has a ``write`` of its own."""
+        """True if the bag needs outputs only, and no derived class overrides ``write``."""
         return not self._measured and type(self).write is Bag.write
 
     def take_rows(self, first: Sample) -> TakeRows:
-        """Write the first sample; return a function that writes further ones by their outputs, with equal inputs."""
+        """Write the first sample; return a function that writes the outputs of further ones, whose inputs are equal."""
         self.write(first)
         self._first = first
         return self._write_rows

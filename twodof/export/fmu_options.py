@@ -30,9 +30,9 @@ class FmuOptions:
         q_start: start positions, rad or m, in the order of the joints or by name; default: the shipped arm's
             positions, or 0 if it is within the limits, or the middle of the limits.
         outputs: further outputs for controllers: "M" mass matrix, "h" nonlinear effects, "J" Jacobian, "drift" J̇ v.
-        free: parameters that are inputs of a native FMU: they may change during a run, and the FMU has derivatives
-            with respect to them. They are groups of ``FREE``, and ``mass:LINK``, ``com:LINK`` and ``inertia:LINK`` by
-            name or shell pattern, the links' values as in ``fit``.
+        free: parameters that become inputs of a native FMU: they may change during a run, and the FMU has derivatives
+            with respect to them. Each is a group of ``FREE``, or a value of a link as in ``fit``: ``mass:LINK``,
+            ``com:LINK`` or ``inertia:LINK``, where LINK is a name or shell pattern.
         settings: start values of variables by name, as in ``experiment``.
         control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
             frame), "joint" or "effort".

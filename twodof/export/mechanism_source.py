@@ -83,7 +83,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[Fr
 
 
 def _tree(robot: JointTree, axes: Sequence[int]) -> str:
-    """Return the joints' parents, of each the independent joint that it follows, the bodies, and the task's axes."""
+    """Return C constants: the parent and the leader of each joint, the bodies, the frames, and the task's axes."""
     rows = {"PARENT": robot.parent, "LEADER": np.abs(robot.G).argmax(axis=1), "LOADED": _indices(robot)}
     lines = [f"static const int {name}[N_BODIES] = {{{', '.join(map(str, row))}}};" for name, row in rows.items()]
     parts = [[", ".join(map(_constant, part.flat)) for part in _parts(body)] for body in robot.body]

@@ -1,4 +1,4 @@
-"""Reference trajectories in an FMU, with which an importer can be checked.
+"""Reference trajectories in an FMU, for checks of importers.
 
 There are four experiments of 0.5 s from the start position. In "move", the robot follows targets, or efforts of a
 controller. In "push", there are also external efforts, rotors, a payload that a controller knows, velocities at the
@@ -187,7 +187,7 @@ def _rubbing(plant: Plant, names: Mapping[str, Variable]) -> dict[str, float | b
 
 
 def _narrowed(plant: Plant, names: Mapping[str, Variable], stimuli: Columns) -> dict[str, float | bool]:
-    """Return joint limits at half of the way that each joint moves without them, rounded as in the file."""
+    """Return joint limits at half of the distance that each joint moves without them, rounded as in the file."""
     ways = _solve(plant, names, ["q"], stimuli, "DOP853", 1e-6)
     ends = {"q_min": np.min, "q_max": np.max}
     return {

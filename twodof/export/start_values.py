@@ -61,7 +61,7 @@ class Variables(Protocol):
         """Return the type of a variable."""
 
     def source_of(self, name: str) -> str:
-        """Return the source of the connection that drives a variable; "" without one."""
+        """Return the output that is connected to a variable; "" without a connection."""
 
 
 def vector(variables: Mapping[str, object], group: str) -> list[str]:

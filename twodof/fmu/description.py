@@ -46,7 +46,7 @@ class Fmu:
         control: name of the control law, e.g. "task"; "" if unknown.
         described: size of its description, bytes.
         inside: name of the FMU's file in the system at ``path``; "" if ``path`` is the FMU.
-        aliases: further names of variables and vectors, and the names that they stand for; of a system.
+        aliases: in a system, further names of variables and vectors, and the names that they stand for.
     """
 
     path: Path
@@ -95,7 +95,7 @@ class Fmu:
 
     @property
     def is_native(self) -> bool:
-        """True if the FMU is a native one of this package, which needs no file but its library."""
+        """True for a native FMU of this package; to run, it needs no file but its library."""
         own = str(self.description.generationTool).startswith("twodof ")
         return own and not self.description.coSimulation.needsExecutionTool
 
@@ -126,7 +126,7 @@ class Fmu:
         return tuple(v.name for v in self.variables.values() if (v.causality, v.type) == ("output", "Real"))
 
     def remarks(self, asked: Iterable[str] = ()) -> list[str]:
-        """Return warnings about settings, one line each; only systems have some."""
+        """Return warnings about settings, one line each; only a system has any."""
         return []
 
     def vector(self, group: str) -> list[str]:
@@ -138,7 +138,7 @@ class Fmu:
         return self.variables[name].value_type
 
     def source_of(self, _name: str) -> str:
-        """Return the source of the connection of a system that drives a variable; "" without one."""
+        """Return the output that is connected to a variable of a system; "" without a connection."""
         return ""
 
     def groups(self, causality: str) -> dict[str, list[str]]:

@@ -1,4 +1,4 @@
-"""Runs of a reference's stimuli in this master and in other FMI tools, by the name of the tool."""
+"""Run the stimuli of a reference experiment in this master, or in another FMI tool that is chosen by name."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -44,7 +44,7 @@ def _starts(fmu: Fmu, reference: Reference) -> Values:
 
 
 def _by_type(fmu: Fmu, *functions: Callable[..., T]) -> Callable[[str], Callable[..., T]]:
-    """Return a choice, by a variable's name, among functions for the types in KINDS."""
+    """Return a function that chooses, by a variable's name, among functions for the types in KINDS."""
     own = dict(zip(KINDS, functions))
     return lambda name: own[fmu.variables[name].type]
 

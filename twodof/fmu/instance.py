@@ -286,7 +286,7 @@ class Instance:
         return type(self)(self.fmu, Path(self.slave.unzipDirectory))
 
     def refuses(self, call: Callable[[], object]) -> bool:
-        """Return whether the FMU answers a call with a status of an error, or logs one."""
+        """Return whether the FMU returns an error status from a call, or logs an error."""
         self._said = ""
         try:
             call()

@@ -1,4 +1,4 @@
-"""Steps of FMUs in spans, in one call if one of their libraries has `twodof_span`, as native FMUs of this package.
+"""Step FMUs many times in one call, if the library of one of them has `twodof_span`, as native FMUs of twodof do.
 
 A call from Python takes longer than a step of a small robot's FMU. Spans are short, so that signals are handled.
 """

@@ -56,7 +56,7 @@ class System(Fmu):
         return f"<System '{self.path}': {', '.join(self.components)}; joints {', '.join(self.joints)}>"
 
     def source_of(self, name: str) -> str:
-        """Return the source of the connection that drives a variable; "" without one."""
+        """Return the output that is connected to a variable; "" without a connection."""
         return next((f"{link.source}" for link in self.links if link.target == self.nodes[name]), "")
 
     def remarks(self, asked: Iterable[str] = ()) -> list[str]:
@@ -310,7 +310,7 @@ def _variables(
 
 
 def _is_plain(wiring: Wiring, node: Node, scalar: Scalar, driving: set[str]) -> bool:
-    """Return whether an input has no name of the robot's vectors, or is a target in SI units that drives the robot."""
+    """Return whether an input keeps its name: it is not RECORDED, or is a target in SI units that drives the robot."""
     group = node.connector.partition("[")[0]
     target = group.endswith("_des") and bool(driving) and scalar.type == "Real"
     return group not in RECORDED or (target and not wiring.unit(node).is_scaled)

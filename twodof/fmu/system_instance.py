@@ -191,9 +191,9 @@ class SystemInstance:
 def _writer(
     instance: Instance, rows: Sequence[tuple[int, Link]], signals: Values
 ) -> tuple[Callable[[], object], Prepared | None]:
-    """Return a function that sets inputs from columns of signals; equal signals in order are not copied.
+    """Return a function that sets inputs from columns of signals, and None or the same call in C.
 
-    For these, the second result is the same call in C.
+    The call in C exists for consecutive columns without conversions, which are not copied.
     """
     names, first = [link.target.connector for _, link in rows], rows[0][0]
     equal = all(link.map == IDENTITY for _, link in rows)

@@ -116,7 +116,7 @@ class Trial:
         instance.initialise(self.start, inf, values or {})
 
     def rows(self, instance: Instance, count: int = 0, first: int = 0) -> list[Outputs]:
-        """Return the outputs after each of ``count`` steps from step ``first`` on; 0: those of a run."""
+        """Return the outputs after each of ``count`` steps (0: all steps of a run) from step ``first`` on."""
         rows: list[Outputs] = []
         read = self.reader(instance)
         for k in range(first, first + (count or self.steps)):

@@ -110,7 +110,7 @@ def two_instances(trial: Trial) -> str:
 
 
 def _other_values(trial: Trial, instance: Instance) -> Values:
-    """Return other values of inputs, real parameters and discrete variables, of each kind if the FMU runs with them."""
+    """Return other values of inputs, real parameters and discrete variables, except kinds that the FMU refuses."""
     values: Values = {}
     for change in (trial.changed_inputs(), trial.changed_parameters(), trial.changed_discrete()):
         with suppress(SimulationError):

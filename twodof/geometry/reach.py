@@ -2,9 +2,9 @@
 
     min |p(q) − p_des|² + |log(R_des R(q)ᵀ)|²   over low ≤ q ≤ high
 
-It is solved from many starts by SciPy's bounded least squares (trust region reflective; Branch, Coleman & Li,
-"A subspace, interior, and conjugate gradient method for large-scale bound-constrained minimization problems",
-SIAM J. Sci. Comput. 21(1), 1999). A metre counts as a radian.
+A metre counts as a radian. SciPy's bounded least squares (trust region reflective) solves the problem from many starts.
+Source: Branch, Coleman & Li, "A subspace, interior, and conjugate gradient method for large-scale bound-constrained
+minimization problems", SIAM J. Sci. Comput. 21(1), 1999.
 """
 
 from collections.abc import Sequence

@@ -215,7 +215,7 @@ def excite(
     progress: Callable[[int, int], None] | None = None,
     **options: Unpack[ModelOptions],
 ) -> Excitation:
-    """Return a motion within the limits of the URDF from whose recording a fit is most precise.
+    """Design a motion within the limits of the URDF whose recording gives the most precise fit.
 
     Collisions are not considered. The design is the same on each call. For many joints and parameters the search ends
     early, with a warning.

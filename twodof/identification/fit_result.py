@@ -64,7 +64,7 @@ class Fit:
         unseen: parameters that form each direction that the data do not determine.
         misfits: test of the model at each joint.
         suspects: errors of the setup that the residuals show, for which the intervals are wider.
-        holds: rests of joints under more than their friction.
+        holds: rests of joints under a load that is larger than their friction.
         fragile: largest change of each parameter, in standard deviations, by constant errors of efforts that the data
             cannot show.
         noise: standard deviation of the efforts' residuals at each joint, N·m or N.
@@ -75,7 +75,7 @@ class Fit:
         covariance: covariance of the parameters, in their order.
         converged: False if the solution still moved when its steps ended; no parameter is known then.
         interrupted: True if Ctrl-C ended the fit.
-        jumps: time of the largest jump, s, by joints whose effort jumps between samples.
+        jumps: for each joint whose effort jumps between samples, the time of the largest jump, s.
         curves: efforts and positions as measured, and as the model gives them.
     """
 

@@ -84,7 +84,7 @@ def apply_pseudo_inverse(
 
 
 def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
-    """Return the distance of the singular values next to a rank from rcond, as ratios to σ_max in descending order.
+    """Return the smallest distance from rcond of the singular values next to a rank, relative to σ_max.
 
     It is negative if the rule σ > rcond·σ_max gives another rank.
     """

@@ -233,7 +233,7 @@ class Stops:
         return (inf, high) if above else (low, inf)
 
     def _stays(self, i: int) -> bool:
-        """Return whether a held joint without a range acts on the others in the same way under all efforts."""
+        """Return whether a held joint without a range acts on the others in the same way whatever its effort is."""
         return self.rigid or (self.rest[i] == CLAMPED and not self.slip[i])
 
     def _has_no_range(self, i: int) -> bool:

@@ -90,7 +90,7 @@ def publish_together(
         robots: experiments by namespace, with equal times; they share the first stamp. A single robot may have the
             namespace "".
         sinks: further consumers of samples, by namespace.
-        network, clock, namespace, options: as in ``Publisher``; all robots share one clock and pause together.
+        network, clock, namespace, and all others: as in ``Publisher``; the robots share one clock and pause together.
         pace, stop: as in ``publish``.
 
     Raises:

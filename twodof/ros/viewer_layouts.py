@@ -39,7 +39,7 @@ def layouts(
 
     Raises:
         BagError: the FMU contains no robot.
-        FmuError: it cannot be read.
+        FmuError: the FMU cannot be read.
         InputError: the namespace is invalid, or a file exists with another content.
         OSError: a file cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Parts that forces and the motion have in an error, from the equations of the controlled robot.
+"""Parts of an error that are due to forces and to the motion, from the equations of the controlled robot.
 
     M q̈_cmd + h_known − s = τ,    q̈_cmd = J⁺ (a − J̇ v + Kn J v) − Kn v,    a = Kp e + Kd (ẋ_des − J v) + ẍ_des
     id(q̈) = τ + tau_ext + Jᵀ f_ext − D v + r

@@ -92,7 +92,7 @@ class Judge:
         self._changed.append((count, held))
 
     def note(self, t: float, inputs: Mapping[str, float]) -> None:
-        """Note inputs that changed at a time, s, as the present ones; the last one that is no target as ``latest``."""
+        """Store the inputs that changed at a time, s; ``latest`` becomes the changes of those that are not targets."""
         changed = {}
         for name in (name for name in inputs if name not in self._where):
             before = self.inputs.get(name, self.setup.starts.get(name, inputs[name]))

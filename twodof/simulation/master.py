@@ -46,9 +46,9 @@ def simulate(
     resume: Resume = ignore,
     **options: Unpack[ExperimentOptions],
 ) -> Summary:
-    """Run an FMU and pass every sample to every sink; sinks open once the FMU is initialised. A notebook shows a bar.
+    """Run an FMU and pass every sample to every sink; sinks open once the FMU is initialised.
 
-    Other arguments and errors as in ``samples``.
+    A notebook shows a progress bar. ``samples`` describes the other arguments, and the errors.
 
     Args:
         stop: as in ``samples``, but after up to 256 short steps if the inputs do not change.
@@ -94,7 +94,7 @@ class Member(NamedTuple):
         return not varies and all(sink.takes_rows for sink in self.sinks)
 
     def repeat(self, last: Sample, stop: Stop) -> Repeat | None:
-        """Return a function that repeats the run until ``stop``; None for one that cannot be repeated."""
+        """Return a function that repeats the run, until ``stop`` returns true; None if it cannot be repeated."""
         steered = self.steer is not ignore or any(type(sink).command is not Sink.command for sink in self.sinks)
         whole = last.k == self.run.steps and self.instance is None and not steered
         return Repeater(self.run, stop) if whole and is_repeatable(self.run) else None

@@ -107,7 +107,7 @@ def _in_radians(judge: Judge) -> dict[str, float]:
 
 
 def _raised(judge: Judge) -> dict[str, float]:
-    """Return the largest gain of its group, or else the usual one, for each proportional gain of 0."""
+    """Return the largest gain of its group, or else the default one, for each proportional gain of 0."""
     raised = dict[str, float]()
     for stiff, _ in GAINS:
         values = judge.given(stiff)
@@ -117,7 +117,7 @@ def _raised(judge: Judge) -> dict[str, float]:
 
 
 def stiffer(judge: Judge, times: float) -> Repetition:
-    """Return the run with some times its gains Kp at the same damping ratio."""
+    """Return the run with gains Kp multiplied by ``times``, at the same damping ratio."""
     factors = {group: factor for pair in GAINS for group, factor in zip(pair, (times, sqrt(times)))}
     values = {group: factor * gain for group, factor in factors.items() if (gain := judge.given(group)).size}
     settings = {f"{group}[{i + 1}]": float(x) for group, value in values.items() for i, x in enumerate(value)}
@@ -125,7 +125,7 @@ def stiffer(judge: Judge, times: float) -> Repetition:
 
 
 def unusual(judge: Judge, stiff: str = "") -> dict[str, float]:
-    """Return the usual value of each gain that has another one; ``stiff`` is the proportional gain of one output."""
+    """Return the default value of each gain that has another one; ``stiff`` is the proportional gain of one output."""
     pairs = [pair for pair in GAINS if stiff in ("", pair[0])]
     each = [(group, i, gain) for pair in pairs for group in pair for i, gain in enumerate(judge.given(group))]
     return {f"{group}[{i + 1}]": USUAL[group] for group, i, gain in each if gain != USUAL[group]}

@@ -131,9 +131,9 @@ class _Trials:
         return "" if result is None else f"without {both}: {self._errors(result)}"
 
     def advised(self, tried: Sequence[Cause]) -> list[Cause]:
-        """Return the causes; the advice of the first one to change gains has the errors of a run with it, if it helps.
+        """Return the causes, with advice to change gains only in the first one, and only if it helps in a run.
 
-        Other causes have no such advice.
+        The advice then has the errors of that run.
         """
         first, *others = tried
         plain = [cause._replace(text=ADVICE.sub(dropped, cause.text)) for cause in others]
@@ -157,7 +157,7 @@ class _Trials:
         return text if text.startswith("RMS") else f"error {text}"
 
     def _error(self, result: Judge, name: str) -> str:
-        """Return an error in words: at the end, or else its RMS, if only that is smaller or larger than in the run."""
+        """Return an error in words: at the end, or the RMS if only one of the two is smaller than in the first run."""
         runs, unit = (result, self._judge), unit_of_error(result, name)
         (last, before), (rms, rms_before) = [run.aims[name].last for run in runs], [_rms(run, name) for run in runs]
         if (last < before) != (rms < rms_before):
@@ -243,7 +243,7 @@ def _sampling(judge: Judge) -> Iterator[Cause]:
 
 
 def _gains(judge: Judge) -> Iterator[Cause]:
-    """Yield gains that differ from the usual ones as a cause."""
+    """Yield gains that differ from the default ones as a cause."""
     if values := {
         group: judge.given(group) for group in dict.fromkeys(name.partition("[")[0] for name in unusual(judge))
     }:

@@ -43,10 +43,10 @@ class Repeater:
     left: float = BUDGET
 
     def __call__(self, plans: Sequence[Repetition]) -> list[Judge | str]:
-        """Run the experiment again for each plan; return the judges, or texts why there is none, "" for a failed run.
+        """Run the experiment again for each plan; return for each its judge, or why there is none ("": it failed).
 
-        A run may take half of what is left, so that a slow one does not prevent all others. If ``stop`` returns true,
-        there are no results: causes with results and others are not comparable.
+        A run may take half of the remaining evaluations, so that a slow run does not prevent all others. If ``stop``
+        returns true, all results are "", because causes with and without results are not comparable.
         """
         try:
             with instantiate(self.run.fmu) as instance, _without_messages():

@@ -95,7 +95,7 @@ class Sink:
 
     @property
     def takes_rows(self) -> bool:
-        """True if ``take_rows`` can stand for ``write``; False here.
+        """True if ``take_rows`` can replace ``write``; False here.
 
         A run whose sinks all take rows, and whose inputs do not change, makes no samples between the first and the last
         one, to save time.

@@ -228,7 +228,7 @@ def _maker(run: Experiment, ends: Sequence[int], first_stamp: int) -> Callable[.
 
 
 def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Resume) -> dict[str, Value]:
-    """Return start values with which a run continues after a failed step; raise without them."""
+    """Return start values with which a run continues after a failed step; raise its error if there are none."""
     doubt = _too_large(run, sample) or far_target(sample)
     failure = step_failure(sample.k, sample.t, error, f"; {doubt}" if doubt else "")
     settings = resume(sample, failure) if error.outcome == "discarded" else None
