@@ -9,7 +9,7 @@ affects all of them; ratios are medians over the rounds.
 - Engine: Dormand-Prince 5(4), rtol 1e-3, atol 1e-6, largest step 1 ms, with controller and limits, which are not
   reached, compiled as in its FMU. If only an unlimited control torque acts, M cancels; otherwise the engine uses the
   general path.
-- CasADi's code (generated.py) runs in the same integrator, in its fastest build, without ranks and payloads.
+- CasADi's code (generated.py) runs in the same integrator, in its fastest build, without rank checks and payloads.
 - MuJoCo (mujoco_step.c): mj_step, RK4, steps of 1 ms, without limits, shapes and contacts; free, and with the
   tutorial's controller in each stage. The library is that of its Python package, which is not imported, because it
   makes the library read the clock, at more than the cost of a step.

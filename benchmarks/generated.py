@@ -1,7 +1,8 @@
 """The native engine with a right-hand side in C that CasADi generates, for comparison.
 
 q̈(q, v) under task control is one CasADi function, made by the textbook's recursions with the robot's constants folded,
-in the native engine's integrator. It has no payload, force or rank. J⁺ is Jᵀ (J Jᵀ)⁻¹, which fails where J loses rank.
+in the native engine's integrator. It has no payload, no external force and no rank check. J⁺ is Jᵀ (J Jᵀ)⁻¹, which
+fails where J loses rank.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 /* The equations of motion under the control law. This file is compiled twice: with real numbers, and with complex
-   numbers for derivatives. A file uses the files included before it. */
+   numbers for derivatives. Each file uses only files that are included before it. */
 #include "turn.c"
 #include "mechanism.c"
 #if N_ROWS > N_AXES

@@ -1,5 +1,6 @@
-/* All files of the FMU, except the derivatives, in one compilation unit, because their functions are static. A file
-   uses the files before it. The headers declare what an earlier file or the derivatives use. */
+/* All files of the FMU, except the derivatives, in one compilation unit, because their functions are static. Each file
+   uses only files that are included before it. The headers declare functions that an earlier file, or the derivatives,
+   call. */
 #include "engine.c"
 #include "dormand_prince.c"
 #include "polynomial.c"

@@ -1,6 +1,6 @@
 /* Declarations for all files of the FMU. The C library, other FMUs and the rest of the process may have functions of
    the same names. Therefore the FMU's functions are static, except those of the standard, `twodof_differentiate`,
-   `twodof_span` and `twodof_evaluations`, which have the prefix of a program that links the FMU's sources. */
+   `twodof_span` and `twodof_evaluations`. A program that links the FMU's sources chooses a prefix for these names. */
 #ifndef INTERNAL_H
 #define INTERNAL_H
 

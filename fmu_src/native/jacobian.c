@@ -4,8 +4,9 @@
        M δq̈ = δτ − ∂ID(q, v, q̈)         ID(q, v, a) = M(q) a + h(q, v)
        δτ   = M̂ δq̈_cmd + ∂ÎD(q, v, q̈_cmd),  0 for an effort at its limit
 
-   where M̂ and ÎD are those of the robot as its law knows it. If it knows all and no effort is limited, the difference of
-   both ∂ID is that for the acceleration q̈ − q̈_cmd without velocity and gravity, and δq̈ contains δq̈_cmd.
+   where M̂ and ÎD are those of the robot as its law knows it. If the law knows the whole robot and no effort is limited,
+   the difference of both ∂ID is that for the acceleration q̈ − q̈_cmd without velocity and gravity, and δq̈ contains
+   δq̈_cmd.
    Source: Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018. */
 #include "control.h"
 #include "directional.h"

@@ -5,7 +5,7 @@
        ẍ(q, v, q̈_cmd) = w(q, v),     N q̈_cmd = −Kn N v
        δq̈_cmd = J⁺ (δw − δẍ) + N (δJᵀ J⁺ᵀ (q̈_cmd + Kn v) − Kn δv)
 
-   Sources: Golub & Pereyra, SIAM J. Numer. Anal. 10(2), 1973; of δẍ, that of jacobian.c. */
+   Sources: Golub & Pereyra, SIAM J. Numer. Anal. 10(2), 1973; for δẍ, the source of jacobian.c. */
 #include "control.h"
 
 #include <string.h>

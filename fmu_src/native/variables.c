@@ -1,5 +1,5 @@
-/* Getting and setting variables. A refused call changes no variable. Each reference stands for as many values as INDEX
-   says, in total n_values. */
+/* Getting and setting variables. A refused call changes no variable. INDEX gives the number of values of each
+   reference; n_values is the sum. */
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
