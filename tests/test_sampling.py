@@ -435,11 +435,11 @@ REFUSED: dict = {
     ("joint", "control_delay"): ({"control_delay": 0.01}, "control_delay = 0.01 needs a control_period > 0"),
     ("joint", "long"): (
         {"control_period": 0.001, "control_delay": 0.0101},
-        "control_delay = 0.0101 must be at most 10 times control_period = 0.001; lessen it",
+        "control_delay = 0.0101 must be at most 10 times control_period = 0.001; reduce it",
     ),
     ("joint", "slightly too long"): (
         {"control_period": 0.01, "control_delay": 0.1000000001},
-        "control_delay = 0.1000000001 must be at most 10 times control_period = 0.01; lessen it",
+        "control_delay = 0.1000000001 must be at most 10 times control_period = 0.01; reduce it",
     ),
     ("joint", "q_noise"): ({"q_noise": 0.1}, "q_noise[1] = 0.1 needs a control_period > 0; set that"),
     ("joint", "v_noise"): ({"v_noise": 0.1}, "v_noise[1] = 0.1 needs a control_period > 0; set that"),

@@ -118,7 +118,7 @@ def test_a_largest_step_beyond_the_budget_is_refused_at_once(max_step):
     assert of.call("advance", values, STEP) == 0
     assert (values == before).all()
     assert of.failure()[0] == MANY_STEPS
-    with pytest.raises(DiscardError, match=f"max_step = {max_step:g} s divides .*; enlarge max_step"):
+    with pytest.raises(DiscardError, match=f"max_step = {max_step:g} s divides .*; increase max_step"):
         plant.step(STEP)
     assert plant.q == [0.5, 0.35]
 
@@ -131,7 +131,7 @@ def test_tolerances_that_nothing_satisfies_are_named(tolerance, length):
     assert of.call("advance", values, STEP) == 0
     assert of.failure()[0] in (MANY_EVALUATIONS, SMALL_STEPS)
     if length(1, 0):
-        with pytest.raises(DiscardError, match=f"^rtol = {tolerance:g} and atol = .* enlarge rtol"):
+        with pytest.raises(DiscardError, match=f"^rtol = {tolerance:g} and atol = .* increase rtol"):
             plant.step(STEP)
 
 

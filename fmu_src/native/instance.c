@@ -82,7 +82,7 @@ static Status check_sampling(Instance *instance)
                       " it out", delay);
     if (delay > MOST_PERIODS * period * (1.0 + 1e-12)) /* 0.11 is more than ten times 0.011 in binary numbers */
         return report(instance, ERROR, "control_delay = %.12g must be at most %d times control_period = %.12g;"
-                      " lessen it, or enlarge control_period", delay, MOST_PERIODS, period);
+                      " reduce it, or increase control_period", delay, MOST_PERIODS, period);
     for (int i = N_JOINTS; i-- > 0 && value[V_FROM_Q] != 0.0;)
         if (value[V_NOISE + i] != 0.0)
             return report(instance, ERROR, "%s = %g has no effect with v_from_q = true; leave one of them out",

@@ -23,15 +23,15 @@ static Status discard(Instance *instance, double point, double h, const Failure 
     if (failure->reason == MANY_STEPS || failure->reason == SHORT_PERIOD) {
         const int limit = failure->reason == MANY_STEPS ? MAX_STEP : CONTROL_PERIOD;
         return report(instance, DISCARD, "%s at %.12g s: %s = %g s divides a step of %g s into more than %d"
-                      " integration steps; enlarge %s or shorten the step", call, point, VARIABLE_NAME[limit],
+                      " integration steps; increase %s or shorten the step", call, point, VARIABLE_NAME[limit],
                       value[limit], h, BUDGET / STAGES, VARIABLE_NAME[limit]);
     }
     char need[80] = "integration steps below the resolution of time";
     if (failure->reason == MANY_EVALUATIONS)
         snprintf(need, sizeof need, "more than %d evaluations for the step of %g s", BUDGET, h);
     return report(instance, DISCARD, "%s at %.12g s: rtol = %g and atol = %g need %s:"
-                  " joint '%s' changes at a rate of %.3g 1/s; shorten the step, lessen damping or"
-                  " gains, or enlarge rtol and atol", call, point, value[RTOL], value[ATOL], need,
+                  " joint '%s' changes at a rate of %.3g 1/s; shorten the step, reduce damping or"
+                  " gains, or increase rtol and atol", call, point, value[RTOL], value[ATOL], need,
                   JOINT_NAME[failure->joint], failure->rate);
 }
 

@@ -141,7 +141,7 @@ class Plant(ControlledPlant):
         if STAGES * h > BUDGET * shortest:
             raise DiscardError(
                 f"{name} = {shortest:g} s divides a step of {h:g} s into more than"
-                f" {BUDGET // STAGES} integration steps; enlarge {name} or shorten the step"
+                f" {BUDGET // STAGES} integration steps; increase {name} or shorten the step"
             )
         before = self.q, self.v, self.sampling, self.time
         self.time = self.time if time is None else time
@@ -165,7 +165,7 @@ class Plant(ControlledPlant):
             raise DiscardError(
                 f"rtol = {self.rtol:g} and atol = {self.atol:g} need {need}:"
                 f" {joint} changes at a rate of {error.rate:.3g} 1/s;"
-                " shorten the step, lessen damping or gains, or enlarge rtol and atol"
+                " shorten the step, reduce damping or gains, or increase rtol and atol"
             ) from error
         self.time += h
 

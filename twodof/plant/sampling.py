@@ -155,7 +155,7 @@ def sampling_refusal(plant: ControlledPlant, of_points: bool) -> str:
     if delay > MOST_PERIODS * period * (1.0 + 1e-12):  # 0.11 is more than ten times 0.011 in binary numbers
         return (
             f"control_delay = {delay:.12g} must be at most {MOST_PERIODS} times control_period = {period:.12g};"
-            " lessen it, or enlarge control_period"
+            " reduce it, or increase control_period"
         )
     sensors = {"q_resolution": plant.q_resolution, "q_noise": plant.q_noise, "v_noise": plant.v_noise}
     given = [f"{group}[{i + 1}] = {x:g}" for group, values in sensors.items() for i, x in enumerate(values) if x]

@@ -123,7 +123,7 @@ def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
         vertices = np.concatenate([surface.vertices for surface in surfaces]) * scale
         if np.abs(vertices).max(initial=0.0) < LARGEST:  # false also for NaN
             return vertices
-        raise ValueError("it has no sound size")
+        raise ValueError("its size is not valid")
     except ValueError as error:
         logger.warning("mesh '%s' is left out of the scene: %s", uri, error)
         return None

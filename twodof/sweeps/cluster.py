@@ -133,7 +133,7 @@ def _result(future: Future, batch: list[Point], batches: Batches) -> list[Row]:
     except TwoDofError:
         raise
     except CancelledError as error:
-        raise SweepError("the scheduler is gone; continue with `resume=True`") from error
+        raise SweepError("the scheduler does not answer any more; continue with `resume=True`") from error
     except Exception as error:
         raise SweepError(f"a worker failed: {error!r:.300}") from error
 
