@@ -598,3 +598,21 @@ def test_calls_that_the_description_excludes_are_refused_and_no_others(flavour, 
             refusals = [message for status, message in driver.log if status == 3]
             assert [message.startswith(f"{name} = ") for message in refusals] == ([] if value == end else [True])
     driver.free()
+
+
+def test_a_member_of_another_fmu_at_the_output_is_not_read(tmp_path, monkeypatch):
+    """It may unpack to gigabytes."""
+    (tmp_path / "robot.urdf").write_text(data_file("urdf", "2dof.urdf").read_text("utf-8"), "utf-8")
+    path = build_fmu(tmp_path / "robot.fmu", FmuOptions(urdf=tmp_path / "robot.urdf"))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("large", b"")
+    read, names = zipfile.ZipFile.read, list[str]()
+
+    def spy(archive, name, *more):
+        names.append(name)
+        return read(archive, name, *more)
+
+    monkeypatch.setattr(zipfile.ZipFile, "read", spy)
+    with pytest.raises(TwoDofError, match="other contents"):
+        build_fmu(path, FmuOptions(urdf=tmp_path / "robot.urdf"))
+    assert "large" not in names

@@ -15,7 +15,7 @@ from harness import python
 
 import twodof
 from twodof.cli.main import main
-from twodof.errors import BagError
+from twodof.errors import BagError, InputError
 from twodof.files import free_name, head_of, write_file
 from twodof.pages.arm import is_page
 
@@ -239,3 +239,26 @@ def test_the_next_writer_removes_the_file_of_a_killed_one(tmp_path):
     assert len([*tmp_path.iterdir()]) == 1
     write_file(tmp_path / "new.csv", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["new.csv"]
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_name_that_is_not_given_is_not_written_through_a_link(there, native_path, tmp_path, monkeypatch, capsys):
+    """A folder from elsewhere may have links to any file, by the names that commands choose."""
+    monkeypatch.chdir(tmp_path)
+    names, away, motions = ("TwoDof.fmu", f"{native_path.stem}.rviz", "excite.csv"), tmp_path / "away", []
+
+    def excite(*_, output, **__):
+        motions.append(output)
+        raise InputError("the design of a motion takes seconds")
+
+    monkeypatch.setattr("twodof.identification.excitation.excite", excite)
+    for name in names:
+        Path(name).symlink_to(away)
+    if there:
+        away.write_bytes(OLD)
+    assert main(["build", *["--overwrite"] * there]) == 1
+    assert main(["layouts", str(native_path), *["--overwrite"] * there]) == 1
+    assert main(["fit", "robot.urdf", "--design", "5", "--free", "friction[1]"]) == 1
+    assert capsys.readouterr().err.count("It is a link, and only outputs that you name are written through links") == 2
+    assert all(Path(name).is_symlink() for name in names) and motions == [Path("excite-2.csv")]
+    assert (away.read_bytes() if there else away.exists()) == (OLD if there else False)

@@ -154,11 +154,14 @@ class _Directory(io.BufferedReader):
         return super().read(size)
 
 
-def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
+def write_file(path: Path, content: bytes | Iterable[bytes], *, follow: bool = True) -> None:
     """Write a file atomically, following links; or write into a device, pipe or /dev/stdout; or raise OSError.
 
-    The umask sets the mode of a new file; a replaced file of this user keeps its mode.
+    The umask sets the mode of a new file; a replaced file of this user keeps its mode. Without ``follow``, links are
+    refused, as for a default name: a folder from elsewhere may have a link of this name to any file.
     """
+    if not follow and path.is_symlink():
+        raise OSError(errno.ELOOP, "It is a link, and only outputs that you name are written through links", str(path))
     descriptor, target, mode, own = descriptor_of(path), target_of(path), 0, True
     with suppress(FileNotFoundError):
         mode, own = (state := os.stat(path)).st_mode, state.st_uid == os.geteuid()
@@ -288,7 +291,7 @@ def _locked(folder: int, how: int) -> bool:
 def free_name(name: str, ending: str = "", replaceable: Callable[[Path], bool] = lambda path: False) -> Path:
     """Return the name, or if a file has it, the name with the first free number from 2 on."""
     names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
-    return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
+    return next(p for p in map(Path, names) if not (os.path.lexists(p) and (p.is_symlink() or not replaceable(p))))
 
 
 def sync(*paths: Path) -> None:

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..files import free_name
 from ..version import install
 from .fmus import is_robot
 from .help import Parser
@@ -94,7 +95,7 @@ def _design(options: argparse.Namespace) -> int:
     from ..identification.excitation import FINE, excite
     from ..simulation.progress import counting
 
-    output = Path(options.output or "excite.csv")
+    output = Path(options.output) if options.output else free_name("excite", ".csv")
     given = given_options(options, "frame", "gravity") | {"lock": parse_locks(options.locks), "output": output}
     with counting("designing", "step", shown=sys.stderr.isatty()) as progress:
         result = excite(options.robot, options.design, options.free, progress=progress, **given)

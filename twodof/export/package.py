@@ -67,11 +67,11 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
             raise _other(path, f"is {'another' if is_fmu(path) else 'not an'} FMU")
         content = _zipped(files, comment, finish)
         built_now = zipfile.ZipFile(io.BytesIO(content))
-        if not replaced and not _fits(path, lambda zipped: _contents(zipped) == _contents(built_now)):
+        if not replaced and not _fits(path, lambda zipped: _is_same(zipped, built_now)):
             raise _other(path, "has the description of this FMU and other contents: it was changed, or others built it")
         with refusing(BuildError, f"write '{path}'"):
             if not _has(path, content):
-                write_file(path, content)
+                write_file(path, content, follow=output is not None)
         if options.native:
             for known in filter(None, map(_known, (comment, key))):
                 remember(known, hashlib.sha256(content).digest())
@@ -101,8 +101,10 @@ def _has(path: Path, content: bytes) -> bool:
     return there and path.read_bytes() == content
 
 
-def _contents(archive: zipfile.ZipFile) -> dict[str, bytes]:
-    return {name: archive.read(name) for name in archive.namelist()}
+def _is_same(archive: zipfile.ZipFile, other: zipfile.ZipFile) -> bool:
+    """Return whether two archives have equal contents; the first may be untrusted, and unpack to gigabytes."""
+    first, second = ({member.filename: member.file_size for member in each.infolist()} for each in (archive, other))
+    return first == second and all(archive.read(name) == other.read(name) for name in first)
 
 
 def _other(path: Path, what: str) -> BuildError:
@@ -124,7 +126,7 @@ def _build_system(output: str | Path | None, options: FmuOptions, *, overwrite: 
         known = overwrite or head_of(path, len(content) + 1) == content
         if path.is_file() and descriptor_of(path) is None and not known:
             raise BuildError(f"'{path}' is another file, and is not replaced: move it away, or use `overwrite=True`")
-        write_file(path, content)
+        write_file(path, content, follow=output is not None)
     return path
 
 

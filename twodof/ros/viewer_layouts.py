@@ -40,8 +40,7 @@ def layouts(
     Raises:
         BagError: the FMU contains no robot.
         FmuError: the FMU cannot be read.
-        InputError: the namespace is invalid, or a file exists with another content.
-        OSError: a file cannot be written.
+        InputError: the namespace is invalid, or a file exists with another content or cannot be written.
     """
     check_name("namespace", namespace)
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
@@ -66,7 +65,8 @@ def layouts(
     with refusing(InputError, f"make the folder '{folder}'"):
         stem.parent.mkdir(parents=True, exist_ok=True)
     for path, content in contents.items():
-        write_file(path, content)
+        with refusing(InputError, f"write '{path}'"):
+            write_file(path, content, follow=False)
     return [*contents]
 
 
