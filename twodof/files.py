@@ -330,7 +330,8 @@ def parsed(text: bytes) -> Any:
 def fits(content: object, shape: object) -> bool:
     """Return whether a JSON value has a given shape and only finite numbers.
 
-    A shape is a type, [x] for a list of x of any length, (x, y) for a list of an x and a y, or {str: x} for x by name.
+    A shape is a type, or describes a list or dict: [x] is a list of x of any length, (x, y) a list of an x and a y, and
+    {str: x} a dict of x by name.
     """
     if isinstance(shape, list):
         return isinstance(content, list) and all(fits(element, shape[0]) for element in content)

@@ -151,8 +151,8 @@ SKEW = 0.1  # sine of the angle between two axes above which their common normal
 def _frames(axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]) -> list[Frame]:
     """Return a frame for each joint, in Pinocchio's frame of the joint, and last a frame for the root.
 
-    z is the joint's axis. x and the origin are on the common normal with the next joint's axis, so that the rotation to
-    the next frame is about x, and its offset has one component less. Source: Khalil & Kleinfinger, "A new geometric
+    z is the joint's axis. x and the origin are on the common normal with the next joint's axis. Therefore the rotation
+    to the next frame is about x, and its offset has one component less. Source: Khalil & Kleinfinger, "A new geometric
     notation for open and closed-loop robots", ICRA 1986.
     """
     frames = []

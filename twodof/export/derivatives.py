@@ -78,7 +78,7 @@ Load = tuple[Body, Array, Array, Array]
 
 
 def joint_force(body: Body, motions: Sequence[Array], beyond: Load) -> tuple[Load, list[Array]]:
-    """Return the load of a joint, and its terms: Bᵀs (its linear part is 0), I s, and the two wrenches above.
+    """Return the load of a joint, and its terms: Bᵀs, whose linear part is 0, I s, and the two wrenches above.
 
     For a body with the momentum p, the first moment d and the inertia J about the origin, B maps an angular velocity w
     to the moment and the force

@@ -117,8 +117,8 @@ def resting_rows(
 ) -> Iterator[tuple[Rows, float, float]]:
     """Yield, for each stretch in which a joint may rest, its row, the variance of its effort, and its middle, s.
 
-    The row is a mean, scaled so that it has the noise of one sample. It is of means of samples, with weights that fade
-    to 0 at both ends, because the noise of positions is large in accelerations that are sampled or cut off.
+    The row is a weighted mean, scaled so that it has the noise of one sample. Its weights fade to 0 at both ends, and
+    samples are averaged first: otherwise the noise of positions would be large in the accelerations.
     """
     for stretch in stretches:
         edge = int(np.ceil(EDGE / stretch.step))

@@ -16,18 +16,18 @@ HOLD_OF_ALL or longer covers all joints at limits. Without holds, an acceleratio
 each other off their limits, would release and stop joints without end. The rank of J⁺ is held in the same way if it
 drops soon after a rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded.
 
-The error of a hold bounds it for the rank (``Slide``) and for stops (``stop_time``). In a hold of
+The error that a hold causes limits its length, for the rank (``Slide``) and for stops (``stop_time``). In a hold of
 length τ, joint i errs by Δa_i τ²/2, where Δa is the difference of the accelerations with and without the hold. This
-must not exceed the tolerance of the error test; at rigid stops, that at the usual rtol, because mutual impacts repeat
-too often at a finer one. The last excursion, of length θ, shows Δa:
+must not exceed the tolerance of the error test. At rigid stops, the tolerance at an rtol of 1e-3 applies if rtol is
+smaller, because mutual impacts would otherwise repeat too often. The last excursion, of length θ, shows Δa:
 
     rank:     Δa = |a_low − Δv/θ|      Δv is the change of velocity under the higher rank
     stop:     Δa = 2|v|/θ              return at v after a start from rest, if the acceleration falls linearly
 
 Except at rigid stops, an excursion is chatter if θ is below the longest hold: its effect is then within the tolerances
-too. So the rule does not depend on the communication step, and fast motion is never held. Rounding ends an excursion
-of a stop that is shorter than FIRST_HOLD, which shows no Δa: such a hold grows only if the excursion follows the last
-hold at once.
+too. Therefore the rule does not depend on the communication step, and fast motion is never held. An excursion from a
+stop that is shorter than FIRST_HOLD ends by rounding, and shows no Δa. The hold after it grows only if the excursion
+follows the last hold at once.
 
 SHORT_CHATTER_TIME applies to each joint that friction holds again at the instant of its release, or that stops within
 FIRST_HOLD of it: there, rounding decides.

@@ -33,14 +33,15 @@ sign.
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
 TIME_RESOLUTION, RELEASE_RESOLUTION, FINEST_RELEASE, COARSEST_RELEASE = 2.0**-52, 2.0**-10, 2.0**-26, 2.0**-5
-"""Resolutions of the time of an event: of all events but a release, as a fraction of the step; the largest and the
-smallest of a release, as fractions of the largest step; and COARSEST_RELEASE times the largest one, as a fraction of a
-short step. At a release the acceleration is 0, so that the error of the state grows with the cube of that of the time.
+"""Resolutions of the time of an event. TIME_RESOLUTION, a fraction of the step, applies to all events but a release.
+The resolution of a release is a fraction of the largest step, from FINEST_RELEASE to RELEASE_RESOLUTION. A step shorter
+than COARSEST_RELEASE times the largest step has a finer one in proportion. At a release the acceleration is 0, so that
+the error of the state grows with the cube of that of the time.
 """
 TOGETHER, WINDOW, USUAL_RTOL = 2.0**-25, 2.0**-6, 1e-3
-"""Fractions of the largest step. Joints that reach rigid stops within the first of an event stop with it. Joints
-that an impact moves, and that come to rest within the second, stop with the impact. Below USUAL_RTOL, the second
-shrinks with rtol, as the first hold at a rigid stop and the resolution of a release do.
+"""TOGETHER and WINDOW are fractions of the largest step. Joints that reach rigid stops within TOGETHER after an event
+stop with it. Joints that an impact moves, and that come to rest within WINDOW, stop with the impact. Below USUAL_RTOL,
+WINDOW shrinks with rtol, as the first hold at a rigid stop and the resolution of a release do.
 """
 THROUGH_THIRDS = np.array([[1, -2.75, 3, -1.125], [0, 4.5, -7.5, 3.375], [0, -2.25, 6, -3.375], [0, 0.5, -1.5, 1.125]])
 """Weights of the efforts at the start, at both thirds and at the end of a stiff step, as those of a dense output."""
@@ -161,8 +162,8 @@ def first_crossing(margin: Margin, slope: Sequence[float], step: float, dip: flo
     """Return the first time at which a position is past a limit or a velocity past 0, or infinity.
 
     ``slope`` has the coefficients of the margin's rate as a polynomial of time over the step, ascending. A margin that
-    is 0 at first may fall below 0 by less than ``dip`` before it is positive: where a joint leaves its limit, an error
-    of the interpolant would otherwise be a crossing.
+    is 0 at first may fall below 0 by less than ``dip`` before it is positive. Otherwise an error of the interpolant
+    would be a crossing where a joint leaves its limit.
     """
     before, at_before = 0.0, margin(0.0)
     turns = [turn * step for turn in (*sign_changes(slope), 1.0)]

@@ -29,8 +29,8 @@ from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 SHORT, LONGER = 0.25, 1024.0
-"""Longest short step, as a fraction of the largest step; and, for joints that stop together, as a multiple of the time
-to the first one.
+"""Longest short step: SHORT is a fraction of the largest step. LONGER, for joints that stop together, is a multiple of
+the time until the first one stops.
 """
 AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
 """Values of the parameter ``integrator``."""
