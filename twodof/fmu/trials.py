@@ -180,7 +180,7 @@ def _restored(trial: Trial, instance: Instance, saved: c_void_p, rows: Sequence[
     trial.note("freeing the state")
     instance.slave.freeFMUState(saved)
     if saved:  # so pythonfmu does, in Python FMUs of this project too: importers do not use a freed state
-        raise UnpassedError("remark", "the pointer to a state is not null after the state was freed, as FMI demands")
+        raise UnpassedError("remark", "the pointer to a state is not null after the state was freed; FMI demands null")
     return f"save, {half} steps, restore, {half} steps: equal"
 
 
