@@ -158,7 +158,7 @@ def write_file(path: Path, content: bytes | Iterable[bytes], *, follow: bool = T
     """Write a file atomically, following links; or write into a device, pipe or /dev/stdout; or raise OSError.
 
     The umask sets the mode of a new file; a replaced file of this user keeps its mode. Without ``follow``, links are
-    refused, as for a default name: a folder from elsewhere may have a link of this name to any file.
+    refused, as for a default name, because an untrusted folder may contain a link of this name to any file.
     """
     if not follow and path.is_symlink():
         raise OSError(errno.ELOOP, "It is a link, and only outputs that you name are written through links", str(path))

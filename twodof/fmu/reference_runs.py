@@ -33,7 +33,7 @@ MANIFEST = "extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"
 TIME_TOLERANCE = 1e-6  # fraction of a communication step
 TRUTHS = {"true": "1", "false": "0"}
 MOST_STEPS = 1_000_000
-PER_FILE = 4096  # bytes that each read of a file counts in addition to its size
+PER_FILE = 4096  # bytes as which each read of a file counts in addition to its size
 Values = dict[str, float | bool | int]
 KINDS: dict[str, Callable[[float], float | bool]] = {"Real": float, "Integer": int, "Boolean": bool}
 """Types of values, and functions that convert numbers to them."""

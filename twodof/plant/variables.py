@@ -218,8 +218,8 @@ def variable_table(
 
     Args:
         robot: the robot; n joints and m task axes give the vectors' lengths.
-        starts: start values that differ from the defaults, by group. "q_start" (n values) is required, and so are
-            "x_des" (m values) and "quat_des" (4 values) if the control law has them.
+        starts: start values that differ from the defaults, by group. "q_start" (n values) is required. "x_des" (m
+            values) and "quat_des" (4 values) are required if the control law has them.
         outputs: groups of ``ON_REQUEST`` that the FMU has.
     """
     law = CONTROLS[control]

@@ -15,7 +15,7 @@ WHOLE = 0.995  # parts above this fraction of the error are not printed: they ba
 NEXT = "seen when the run is repeated without the first cause"
 ADVICE = re.compile(r"; (raise Kp|raise the gains|lower the gains)(, or |(?=$|;))")
 """Advice without a size; a repeated run may have shown that it helps."""
-MANY = 1.0  # overshoot, as a fraction of the way, from which on it is printed as a distance
+MANY = 1.0  # overshoot, as a fraction of the distance, from which on it is printed as a distance
 PLAIN = ("reach", "degrees", *MOTION)  # kinds whose texts have no error of their joint
 RUNAWAY = ("diverged", "unstable")  # kinds of a first cause after which notes are not printed
 NEAR = 0.5  # part of a limit from which on a peak is printed for a run that failed
