@@ -114,10 +114,7 @@ def test_a_run_without_its_cause_does_well(name: str, cured: dict[str, Any], sam
         ({"x_des": (0.5, 0.1), "Kp": (900.0, 100.0)}, "with Kp = (900, 100), Kd = 40"),
         ({"payload": 0.35, "Kd": 1.0, "x_des": (0.2354, 0.1774)}, ", the target is passed by 0.315 m, RMS error"),
         ({"Kp": 0.5}, "joint 'joint2' still moving at"),
-        (
-            {"Kp": 1000.0, "Kd": 5.0, "x_des": (-0.107, 0.4107)},
-            "beyond the URDF's limit of 10 N·m; the same for 'joint2'",
-        ),
+        ({"Kp": 1000.0, "Kd": 5.0, "x_des": (-0.107, 0.4107)}, "beyond the URDF's limit of 10 N·m, likewise 'joint2'"),
         (LATE, "at the same damping ratio it is stable below Kp = 189 with Kd = 22.9, and quickest with"),
         (
             {**NOISY, "Kp": 900.0},
@@ -275,7 +272,7 @@ def test_a_line_names_each_joint_once() -> None:
     stands = [Cause("limit", f"joint '{name}' stood", joint=name) for name in ("a", "b", "a", "c", "b")]
     for count, others in ((4, "'b', 'c'"), (3, "all other joints")):
         texts = [cause.text for cause in _grouped((Cause("gain", "a gain"), *stands), count, "")]
-        assert texts == ["a gain", f"joint 'a' stood; the same for {others}"]
+        assert texts == ["a gain", f"joint 'a' stood, likewise {others}"]
 
 
 def test_a_bag_a_figure_and_a_page_say_the_same(
@@ -713,7 +710,7 @@ def test_a_peak_effort_of_a_run_that_reaches_its_target_has_no_error() -> None:
 def test_the_joint_with_the_largest_error_leads_its_line() -> None:
     settings = {"q_des": (0.55, 0.8), "friction": (3.0, 2.0)}
     first = twodof.simulate(fmu_of("arm", "joint"), settings=settings).verdict.lines[0]
-    assert re.search(r"\('joint2'\); joint 'joint2' sticks: .*; the same for 'joint1'", first), first
+    assert re.search(r"\('joint2'\); joint 'joint2' sticks: .*, likewise 'joint1'", first), first
 
 
 def test_an_error_that_grows_under_a_load_is_not_a_matter_of_time() -> None:

@@ -54,7 +54,7 @@ export class Verdict {
       if (each.joint < 0) return [each];
       const names = same.length === this.joints.length && same.length > 2 ? "all other joints"
         : same.slice(1).map(({ joint }) => `'${this.joints[joint].name}'`).join(", ");
-      const text = each.text.replace(/\??$/, (end) => (names && `; the same for ${names}`) + end);
+      const text = each.text.replace(/;|$/, (end) => (names && `, likewise ${names}`) + end);
       return each === same[0] ? [{ ...each, text }] : [];
     });
   }

@@ -16,8 +16,7 @@ Array = NDArray[np.float64]
 LINEAR = 0.05  # residual, relative to the second differences, above which the motion is not linear
 VISIBLE = 1e-3  # fraction of a signal's range below which swings are not counted
 LASTING = 0.01  # fraction of the scale: a smaller amplitude at the end counts as rest
-REPEATED = 3  # periods, each from one crossing of the mean to the next but one, from which on a motion repeats
-UNLIKE = 2.0  # ratio of the longest to the shortest period of an oscillation
+LASTS = 0.5  # fraction of the time that the crossings of an oscillation span at least
 UNEVEN = 1e-6  # fraction of the duration by which uneven times differ from evenly spaced ones
 GROWTH = 1.5  # ratio of the amplitudes in the last and the third quarter
 
@@ -62,16 +61,15 @@ def swings(y: Array) -> int:
 def _by_crossings(t: Array, y: Array) -> Ringing | None:
     """Return frequency and damping by the crossings of the mean in the last half, and by its swings.
 
-    One jolt, as at a stop, is no oscillation: periods must repeat.
+    The crossings of an oscillation span half of that time at least, unlike those of a jolt at a stop.
     """
     half = len(y) // 2
     t, y = t[half:], y[half:] - np.mean(y[half:])
     k = np.flatnonzero(np.sign(y[1:]) * np.sign(y[:-1]) < 0)
-    if swings(y) < 3:
+    if len(k) < 3 or swings(y) < 3:
         return None
     crossed = t[k] + (t[k + 1] - t[k]) * y[k] / (y[k] - y[k + 1])
-    periods = crossed[2:] - crossed[:-2]
-    if len(periods) < REPEATED or periods.max() > UNLIKE * periods.min():
+    if crossed[-1] - crossed[0] < LASTS * (t[-1] - t[0]):
         return None
     frequency = (len(k) - 1) / (2.0 * (crossed[-1] - crossed[0]))
     peaks = np.maximum.reduceat(np.abs(y), k + 1)[:-1]

@@ -7,12 +7,12 @@ import numpy as np
 
 from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
 from .controller_causes import damping, feedforward, load
-from .judge import OF_THE_END, Judge
+from .judge import Judge
+from .outcome import errors_at_the_end, missed_outputs, success
 from .remedies import SAMPLING, STIFFER, Repetition, named, stiffer, unusual, without
-from .verdict_text import ADVICE, NEXT, dropped, unit_of_error, worst_joint
+from .verdict_text import ADVICE, HALF, NEXT, dropped, unit_of_error, worst_joint
 
 LITTLE = 0.1  # part of the error; if each cause removes less, their order is kept
-HALF = 0.5  # part of the error; if no cause removes as much, all other settings are tried
 WHOLE = 0.9  # part of the error whose removal explains all consequences
 
 
@@ -64,8 +64,10 @@ def by_removal(
         return tuple(tried), ""
     left = {(c.kind, c.joint, c.subject): c for c in causes_of(root) if not c.noted}
     known = [(cause.kind, cause.joint, cause.subject) for cause in tried]
+    beyond = [_is_beyond(cause, tried) for cause in tried]
     tried = [
-        c._replace(noted=c.noted and (key not in left or _is_beyond(c, tried))) for c, key in zip(tried, known)
+        c._replace(noted=c.noted and (key not in left or same), tried="" if same else c.tried)
+        for c, key, same in zip(tried, known, beyond)
     ]  # it acts without the first
     rest = [cause for key, cause in left.items() if key not in known]
     rest = [cause._replace(text=f"{NEXT}: {ADVICE.sub(dropped, cause.text)}", part=None) for cause in rest[:1]]
@@ -152,9 +154,10 @@ class _Trials:
         return sum(_rms(result, name) / largest[name] for name in self._missed)
 
     def _errors(self, result: Judge) -> str:
-        """Return the errors of the missed outputs at the end of a repeated run in words."""
+        """Return the errors of the missed outputs at the end of a repeated run in words, and whether it succeeds."""
         text = " and ".join(self._error(result, name) for name in self._missed)
-        return text if text.startswith("RMS") else f"error {text}"
+        still = "still not " if missed_outputs(result) else ""
+        return f"{text if text.startswith('RMS') else f'error {text}'}, {still}{success(result)}"
 
     def _error(self, result: Judge, name: str) -> str:
         """Return an error in words: at the end, or the RMS if only one of the two is smaller than in the first run."""
@@ -176,8 +179,7 @@ class _Trials:
 
 def _rms(judge: Judge, name: str) -> float:
     """Return the RMS error of an output at the end of a run, m or rad."""
-    late = judge.history() >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)
-    return float(np.sqrt(np.mean(judge.error_history(name)[late] ** 2)))
+    return float(np.sqrt(np.mean(errors_at_the_end(judge, name) ** 2)))
 
 
 def _most(tried: Sequence[Cause]) -> float:

@@ -30,7 +30,8 @@ def slow(judge: Judge, missed: Sequence[str], static: Mapping[str, float]) -> It
         rate = min(rate, _slowest(judge, name)) if rate else 0.0
         band = max(BAND * aim.first, FLOOR)
         left = log(max(aim.last / band, 1.0)) / rate if rate else 0.0
-        left += OF_THE_END * (judge.duration - judge.changed)  # the error must stay there
+        rest = OF_THE_END * (judge.duration - judge.changed)  # the last part of the longer run is in the band
+        left = (left + rest) / (1.0 - OF_THE_END)
         what = {"x": "the position still approaches its target", "quat": "the orientation still approaches its target"}
         what["q"] = "the joints still approach their targets"
         raised, approaches = stiff, what[name]

@@ -11,18 +11,15 @@ import numpy as np
 
 from ..bounds import MAX_VALUE
 from ..files import NUMBER
-from .aim import BAND
 from .cause import FLOOR, Cause
 from .causes import causes
 from .expressions import expression
-from .judge import BLOCK, OF_THE_END, OUTPUTS, Judge
+from .judge import BLOCK, OUTPUTS, Judge
 from .motion import motion_of
+from .outcome import missed_outputs, success
 from .removal import Repeat, by_removal
 from .setup import Array, Setup
 from .verdict_text import lines_of
-
-HELD = 1e-3  # m, rad: a smaller error of an output that is held, and that only falls, is no failure
-FOLLOWED = 0.1  # fraction of the target's travel: with a larger RMS error in the second half, a target is not followed
 
 
 class Metric(NamedTuple):
@@ -186,9 +183,8 @@ def conclude(judge: Judge, repeat: Repeat | None = None) -> Verdict:
     motion, found, _ = motion_of(t, signals, scale)
     if found is not None:
         numbers |= {"frequency": found.frequency, "damping": found.damping}
-    moving = judge.moving
-    missed = _missed(judge)
-    outcome = ("not " if missed else "") + ("followed" if moving else "reached") if judge.aims else "no target"
+    missed = missed_outputs(judge)
+    outcome = ("not " if missed else "") + success(judge) if judge.aims else "no target"
     motion = "diverging" if judge.lost else motion
     why = (*judge.lost, *(extreme or causes(judge, missed, motion)))
     together = ""
@@ -247,24 +243,5 @@ def _signals(judge: Judge) -> tuple[Array, Array, float]:
 
 def _causes_of(judge: Judge) -> tuple[Cause, ...]:
     """Return the causes of a repeated run; none if it reaches its target."""
-    missed = _missed(judge)
+    missed = missed_outputs(judge)
     return causes(judge, missed, motion_of(*_signals(judge))[0]) if missed else ()
-
-
-def _missed(judge: Judge) -> list[str]:
-    """Return the outputs that are not at their targets during the last part of the run, or do not follow them."""
-    if judge.moving:
-        return _lagging(judge)
-    missed, t = [], judge.history()
-    for name, aim in judge.aims.items():
-        late = judge.error_history(name)[t >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)]
-        held = aim.first <= FLOOR and (np.diff(late) <= 0.0).all()
-        if not max(aim.last, late.max(initial=0.0)) <= max(BAND * aim.first, HELD if held else FLOOR) < inf:
-            missed.append(name)
-    return missed
-
-
-def _lagging(judge: Judge) -> list[str]:
-    """Return the outputs that do not follow their moving targets in the second half of the run."""
-    late = {name: judge.error_history(name)[len(judge.history()) // 2 :] for name in judge.aims}
-    return [name for name, e in late.items() if np.sqrt(np.mean(e * e)) > max(FOLLOWED * judge.travel, FLOOR)]

@@ -10,7 +10,10 @@ from .aim import SMALLEST_MOVE
 from .cause import FLOOR, MOTION, MOVING, SMALL, Cause, point_text
 from .controller_causes import STILL, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
+from .outcome import SUCCESS, missed_outputs
 
+HALF = 0.5  # part of the error; if the first cause removes less, it does not explain the failure
+SUCCESSES = tuple(f", {word}" for word in SUCCESS)  # ends of the errors of a run that does not fail
 WHOLE = 0.995  # parts above this fraction of the error are not printed: they balance each other
 NEXT = "seen when the run is repeated without the first cause"
 ADVICE = re.compile(r"; (raise Kp|raise the gains|lower the gains)(, or |(?=$|;))")
@@ -51,6 +54,9 @@ def lines_of(
     causes = [_completed(judge, cause, worst, left) for cause in _grouped(why, len(judge.setup.joints), worst)]
     if why and not why[0].noted:
         but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
+        first = why[0].removes
+        if first is not None and first < HALF and together.endswith(SUCCESSES):
+            but, together = f"{but}several causes act together ({together}), first: ", ""
         head += f"{but}{causes[0].text}"
     elif outcome.startswith("not"):
         head += "; no cause is found in the samples"
@@ -95,10 +101,8 @@ def _grouped(why: tuple[Cause, ...], count: int, worst: str) -> list[Cause]:
             joints = dict.fromkeys(other.joint for other in same if other.joint != lead.joint)
             names = ", ".join(f"'{joint}'" for joint in joints)  # a joint may stand at both of its limits
             names = "all other joints" if len(joints) == count - 1 > 1 else names
-            question = "?" * lead.text.endswith("?")
-            grouped.append(
-                lead._replace(text=lead.text.rstrip("?") + f"; the same for {names}" * bool(names) + question)
-            )
+            text, *remedy = lead.text.split("; ", 1)
+            grouped.append(lead._replace(text="; ".join([text + f", likewise {names}" * bool(names), *remedy])))
     first = {cause.tried: cause for cause in reversed(grouped)}
     return [c if not c.tried or first[c.tried] is c else c._replace(tried="", part=None) for c in grouped]
 
@@ -132,6 +136,7 @@ def _completed(judge: Judge, cause: Cause, worst: str, parts: dict[str, float]) 
         off = abs(judge.wanted("q")[own] - judge.end("q")[own])
         facts.append(f"its own error is {off:.3g} {judge.setup.units[own]}".strip())
     if cause.tried:
+        facts += ["it reduces the error"] * (cause.noted and (cause.removes or 0.0) < 0.0)
         facts.append(cause.tried)
     elif cause.part is not None and part is not None:
         percent = f"{100.0 * abs(part):.2g} %"
@@ -166,17 +171,18 @@ def _settings(judge: Judge) -> str:
 
 
 def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
-    """Return the errors at the end in words."""
-    texts = []
+    """Return the errors at the end in words, those of missed outputs first."""
+    texts = {}
     if "final_error" in numbers:
         target = point_text(judge.wanted("x"))
-        texts.append(f"{numbers['final_error']:.3g} m from the target {target} m")
+        texts["x"] = f"{numbers['final_error']:.3g} m from the target {target} m"
     if "final_turn_error" in numbers:
-        texts.append(f"{numbers['final_turn_error']:.3g} rad from the target orientation")
+        texts["quat"] = f"{numbers['final_turn_error']:.3g} rad from the target orientation"
     if "final_joint_error" in numbers:
         far, joint = worst_joint(judge)
-        texts.append(f"joint errors of up to {far} ('{joint}')")
-    return texts
+        texts["q"] = f"joint errors of up to {far} ('{joint}')"
+    missed = missed_outputs(judge)
+    return [texts[name] for name in sorted(texts, key=lambda name: name not in missed)]
 
 
 def worst_joint(judge: Judge) -> tuple[str, str]:
@@ -198,7 +204,11 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
             for name, aim in moves.items()
             if aim.last > aim.first
         ]
-        firsts = " and ".join(f"{aim.first:.3g} {units[name]}" for name, aim in moves.items() if units[name])
+        firsts = " and ".join(
+            f"{aim.first:.3g} {units[name]}" + " over all joints" * (name == "q" and len(judge.setup.joints) > 1)
+            for name, aim in moves.items()
+            if units[name]
+        )
         late = ", ".join(grown) or "not within 2 % of the initial error" + f" of {firsts}" * bool(firsts)
         moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
         only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
@@ -212,7 +222,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
             parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else f"the target is passed by {size}")
     elif outcome == "not reached":
         parts.append("the run starts at its target")
-    if "rms_error" in numbers:
+    if "rms_error" in numbers and "x" in (missed_outputs(judge) or "x"):
         parts.append(f"RMS error {numbers['rms_error']:.3g} m")
     if not parts and outcome == "no target":
         return ""
