@@ -293,4 +293,4 @@ def test_a_name_of_a_system_that_is_mistyped_suggests_the_nearest(name: str, mea
 
 
 def test_a_tab_in_a_name_is_printed_as_an_escape() -> None:
-    assert plain("joint\t1\n") == "joint\\t1\n"
+    assert plain("joint\t1\n") == "joint\\t1\\n"
