@@ -1,5 +1,6 @@
 """Malicious files: a command refuses them with one clear line, or reads them in bounded time and memory."""
 
+import io
 import os
 import shutil
 import zipfile
@@ -15,6 +16,7 @@ from jail import the_jail as the_jail
 
 import twodof
 from twodof.errors import FmuError
+from twodof.files import read_member
 
 pytestmark = pytest.mark.long
 
@@ -405,3 +407,17 @@ HOSTILE: dict[str, Mapping[str, object]] = {
     "large_urdf": LARGE_URDFS,
     "hostile_csv": HOSTILE_CSVS,
 }
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_member_that_is_shorter_than_stated_is_refused(method: int) -> None:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", method) as archive:
+        archive.writestr("a", b"x" * 100)
+        archive.writestr("b", b"y" * 100)
+    with zipfile.ZipFile(content) as archive:
+        member = archive.getinfo("a")
+        member.file_size = 100_000
+        member.compress_size += 99_900 * (method == zipfile.ZIP_STORED)
+        with pytest.raises(zipfile.BadZipFile, match="its member 'a' is shorter than stated"):
+            read_member(archive, "a", 1_000_000)

@@ -141,8 +141,12 @@ def read_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
     member = archive.getinfo(name)
     if member.file_size > most:
         raise UnsafeArchiveError(f"its member '{name}' is larger than {most} bytes")
-    with archive.open(member) as file:  # returns at most the size in the list of members
-        return file.read(member.file_size)
+    content = b""
+    with suppress(EOFError), archive.open(member) as file:  # returns at most the size in the list of members
+        content = file.read(member.file_size)
+    if len(content) < member.file_size:
+        raise zipfile.BadZipFile(f"its member '{name}' is shorter than stated")
+    return content
 
 
 class _Directory(io.BufferedReader):
