@@ -8,9 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from bags import joint_message, write_third_party
 from harness import forged
 
 import twodof
+from twodof.cli.main import MOST_MESSAGES
 from twodof.files import data_file
 
 TWODOF = [sys.executable, "-m", "twodof"]
@@ -122,3 +124,14 @@ def test_a_line_break_in_a_name_begins_no_line(tmp_path):
     assert {line.partition(" ")[0] for line in done.stderr.splitlines()} == {"WARNING:"}
     printed = run("info", "robot.fmu", "--json", cwd=tmp_path).stdout
     assert json.loads(printed)["joints"][0] == "a\ntwodof: error: b"
+
+
+def test_a_file_causes_a_limited_number_of_messages(tmp_path):
+    """The font has none of the characters of these names."""
+    names = ["".join(chr(0x4E00 + 10 * i + k) for k in range(10)) for i in range(10)]
+    state = joint_message(1, names, [0.0] * 10)
+    write_third_party(tmp_path / "bag", [("/joint_states", stamp, state) for stamp in (1, 2)])
+    done = run("plot", "bag", "-o", "plot.png", cwd=tmp_path)
+    lines = done.stderr.splitlines()
+    assert (done.returncode, len(lines)) == (0, MOST_MESSAGES)
+    assert lines[-1] == "WARNING: further messages are not shown"

@@ -27,6 +27,7 @@ INPUTS = ("fmu", "urdf", "robot", "bag", "bags", "robots", "input")
 VERBS = (build, run, publish, layouts, check, info, linearise, fit, plot, view, live, page, sweep, export, recover)
 """The verbs in the order of the help, which has the first line of each docstring."""
 LONGEST_LINE = 2000
+MOST_MESSAGES = 50  # an untrusted file may cause thousands of warnings, for example of a font without its characters
 
 
 def parser() -> tuple[Parser, dict[str, Parser]]:
@@ -62,6 +63,18 @@ class _Words(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         line = _shortened(in_options(super().format(record)))
         return f"{CLEAR}{line}" if sys.stderr.isatty() else line  # overwrites a progress line
+
+
+class _Few(logging.Filter):
+    """Log filter that passes a limited number of messages; the last one says so."""
+
+    _count = 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        self._count += 1
+        if self._count == MOST_MESSAGES:
+            record.msg, record.args = "further messages are not shown", ()
+        return self._count <= MOST_MESSAGES
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -118,6 +131,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
         sys.stdout.reconfigure(errors="backslashreplace")
     log = logging.StreamHandler()
     log.setFormatter(_Words("%(levelname)s: %(message)s"))
+    log.addFilter(_Few())
     logging.basicConfig(handlers=[log], level=logging.WARNING)
     # messages of matplotlib contain names from untrusted files
     warnings.showwarning = lambda warning, *_, **__: logging.getLogger("twodof").warning("%s", warning)
