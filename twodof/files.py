@@ -217,7 +217,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     Without a parent folder it is in the system's folder for temporary files.
     """
     try:
-        parent = Path(tempfile.gettempdir() if parent is None else parent)
+        parent = Path(tempfile.gettempdir()).absolute() if parent is None else Path(parent)  # TMPDIR may be relative
     except FileNotFoundError as error:
         raise OSError(error.errno, f"{error.strerror}; name one in TMPDIR") from error
     for left in parent.glob(f"{TEMPORARY}*"):

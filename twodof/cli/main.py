@@ -40,8 +40,8 @@ def parser() -> tuple[Parser, dict[str, Parser]]:
     program.add_argument("--version", action="version", version=f"twodof {__version__}")
     verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb in VERBS:
-        text = str(verb.__doc__).partition(": ")[2].rstrip(".\n")
         name = verb.__name__.rpartition(".")[2]
+        text = (verb.__doc__ or f": {name}").partition(": ")[2].rstrip(".\n")  # PYTHONOPTIMIZE=2 leaves docstrings out
         added = verbs.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         added.set_defaults(call=verb.call)
         verb.add(added)
