@@ -53,7 +53,7 @@ MISTAKES: dict[str, str] = {
     "build --robot": "argument --robot: expected one argument: NAME, .*--list-robots",
     "build --robot UR5": "no robot 'UR5'; did you mean 'ur5_robot'",
     "export bag": "an export needs the name of its file, as in -o bag.csv",
-    "build --frame": "expected one argument: FRAME, controlled link",
+    "build --frame": "expected one argument: LINK, controlled link",
     "xyzzy": "no verb 'xyzzy'; there are: build, run, ",
     "help simulate": "'simulate'; did you mean 'run'",
     "--versoin": "no option '--versoin'; did you mean '--version'",

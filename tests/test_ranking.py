@@ -84,11 +84,11 @@ def test_a_run_prints_all_of_its_errors_and_limits(ur5, tmp_path, capsys):
     bag = str(tmp_path / "bag")
     assert main(["run", str(ur5["pose"]), "-o", bag, "--effort", *sets]) == 0
     out = capsys.readouterr().out
-    assert " rad from the target orientation; " in out
+    assert " rad from the target orientation" in out
     assert " N·m, beyond the URDF's limit of 28 N·m" in out
     assert main(["plot", bag, "-o", str(tmp_path / "plot.png")]) == 0
     out = capsys.readouterr().out
-    assert " rad from the target orientation; " in out and "beyond the URDF's limit of 28" in out
+    assert " rad from the target orientation" in out and "beyond the URDF's limit of 28" in out
     summary = twodof.simulate(ur5["pose"], settings={"quat_des": GOAL, "Kp_rot": 400.0}, stop_time=0.3)
     assert f" {summary.turn_error:.3g} rad from the target orientation" in out
     assert main(["run", str(ur5["joint"]), "-o", bag, "--overwrite", "--json"]) == 0

@@ -142,7 +142,7 @@ def test_several_causes_are_ranked_by_the_errors_without_each(fmus: dict[str, Pa
     lines = twodof.simulate(fmus[fmu], settings=settings).verdict.lines
     for line, expected in zip(lines, words):
         assert re.search(expected, line), lines
-    assert "xd_des" not in " ".join(lines)
+    assert "xd_des" not in " ".join(line for line in lines if not line.startswith("with "))
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,7 @@ export class Verdict {
   feedforward(missed) {
     const rates = [["xd_des", "xdd_des", "v_des", "a_des"], ["omega_des", "alpha_des"]];
     return rates.flatMap((groups, k) => (missed[k] ? groups : [])).filter((group) => this.session.held(group).some(Boolean)).map((group) =>
-      cause("feedforward", `${group} = (${this.session.held(group).map(short).join(", ")}) is not 0, while the target rests`, 0, -1, group));
+      cause("feedforward", `${group} = (${this.session.held(group).map(short).join(", ")}) is not 0, while the target rests; set it to 0`, 0, -1, group));
   }
 
   atLimits() {

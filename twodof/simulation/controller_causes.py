@@ -60,7 +60,7 @@ def feedforward(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     for group in (group for name in missed for group in groups[name]):
         values = judge.given(group)
         if values.any() and not judge.moving:
-            text = f"{group} = {point_text(values)} is not 0, while the target rests"
+            text = f"{group} = {point_text(values)} is not 0, while the target rests; set it to 0"
             yield Cause("feedforward", text, 1.0, subject=group)
     for stiff, damp, group in (
         ("Kp", "Kd", groups["q" if "q" in missed else "x"][0]),

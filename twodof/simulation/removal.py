@@ -5,6 +5,7 @@ from math import inf, isfinite
 
 import numpy as np
 
+from ..plant.variables import EXACT
 from .cause import FLOOR, FOLLOWING, SMALL, Cause, point_text
 from .controller_causes import damping, feedforward, load
 from .judge import Judge
@@ -144,7 +145,9 @@ class _Trials:
         self._run([plan := stiffer(self._judge, STIFFER if advice[1].startswith("raise") else 1.0 / STIFFER)])
         if (result := self._results.get(plan)) is None:
             return [first, *plain]
-        sized = f"; {advice[1]} ({plan.words}: {self._errors(result)}){advice[2]}"
+        beyond = any((use > 1.0 + EXACT).any() for use in result.use())
+        peaks = ", with peaks beyond the URDF's limits" * beyond
+        sized = f"; {advice[1]} ({plan.words}: {self._errors(result)}{peaks}){advice[2]}"
         helps = self._size(result) < HALF * self._size(self._judge)
         return [first._replace(text=first.text.replace(advice[0], sized if helps else dropped(advice))), *plain]
 

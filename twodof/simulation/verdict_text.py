@@ -10,8 +10,9 @@ from .aim import SMALLEST_MOVE
 from .cause import FLOOR, MOTION, MOVING, SMALL, Cause, point_text
 from .controller_causes import STILL, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
-from .outcome import SUCCESS, missed_outputs
+from .outcome import SUCCESS, errors_at_the_end, missed_outputs
 
+PASSING = 2.0  # ratio of the largest of the last errors to the last one, from which on it is printed
 HALF = 0.5  # part of the error; if the first cause removes less, it does not explain the failure
 SUCCESSES = tuple(f", {word}" for word in SUCCESS)  # ends of the errors of a run that does not fail
 WHOLE = 0.995  # parts above this fraction of the error are not printed: they balance each other
@@ -33,9 +34,11 @@ CONTROLLER = {
     "control_delay": " s",
     "payload": " kg",
     "f_ext": " N",
-    **dict.fromkeys(("tau_ext", "friction", "damping", "q_resolution", "q_noise", "v_noise"), ""),
+    "xd_des": " m/s",
+    "xdd_des": " m/s²",
+    **dict.fromkeys(("tau_ext", "friction", "damping", "armature", "q_resolution", "q_noise", "v_noise"), ""),
 }
-"""Settings that the verdict of a run that failed names if they are not 0; units without those of gains and joints."""
+"""Settings that a verdict with a cause names if they are not 0; units without those of gains and joints."""
 
 
 def lines_of(
@@ -64,7 +67,7 @@ def lines_of(
     notes = [
         f"note: {ADVICE.sub(dropped, cause.text)}" for cause in causes if cause.noted and why[0].kind not in RUNAWAY
     ]
-    settings = _settings(judge) if outcome.startswith("not") else ""
+    settings = _settings(judge) if why else ""
     lines = [
         head,
         *(text for text in also if NEXT not in text),
@@ -214,6 +217,12 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
         only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
         within = only if outcome == "not reached" else f"within 2 % after {settling:.4g} s"
         parts.append(late if settling == inf else within)
+        ends = {name: float(errors_at_the_end(judge, name).max(initial=0.0)) for name in units}
+        parts += [
+            f"errors of the {ERRORS[name]} of up to {most:.3g} {units[name]} in the last tenth of the run"
+            for name, most in ends.items()
+            if most > PASSING * max(moves[name].last, FLOOR) and units[name] and outcome == "not reached"
+        ]
         if "overshoot" in numbers and (numbers["overshoot"] or outcome == "reached"):
             past = numbers["overshoot"]
             name, aim = next(iter(judge.aims.items()))
