@@ -25,6 +25,7 @@ from bags import (
     both_storages,
     channel,
     content,
+    joint_message,
     joint_state,
     logging,
     message,
@@ -34,6 +35,7 @@ from bags import (
     read_with_sqlite3,
     record,
     sample,
+    serialised,
     texts,
     unfinished,
 )
@@ -315,6 +317,19 @@ def test_no_more_profiles_are_read_than_take_no_time(tmp_path, monkeypatch):
     monkeypatch.setattr("twodof.bag.recovery.MAX_PROFILES", 2000)
     assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
     assert read == profiles[:3]
+
+
+def test_a_file_is_recovered_in_a_folder_of_its_own(tmp_path):
+    """A bag may be a single MCAP file, and its refusal names a remedy that works."""
+    file = tmp_path / "cut.mcap"
+    file.write_bytes(HEADER + SCHEMA + CHANNEL + message(serialised(joint_message(1, ["a"], [0.0]))))
+    with pytest.raises(BagError, match="move it into a folder of its own, and 'twodof recover' of that folder"):
+        twodof.read_bag(file)
+    with pytest.raises(BagError, match="is a file; move it into a folder of its own, and recover that folder"):
+        twodof.recover(file)
+    (tmp_path / "bag").mkdir()
+    file.rename(tmp_path / "bag/cut.mcap")
+    assert twodof.recover(tmp_path / "bag").counts == {"/joint_states": 1}
 
 
 def test_no_more_profiles_are_written_than_readers_parse_in_time(tmp_path, monkeypatch):

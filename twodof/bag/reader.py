@@ -99,9 +99,10 @@ def _refusing(path: Path) -> Iterator[None]:
     except OSError as error:
         raise BagError(f"cannot read the bag '{path}': {error.strerror}") from error
     except DamageError as error:
-        raise BagError(
-            f"cannot read the bag '{path}': {error}; 'twodof recover {path}' saves what comes before"
-        ) from error
+        remedy = f"'twodof recover {path}'"
+        if path.is_file():
+            remedy = "move it into a folder of its own, and 'twodof recover' of that folder"
+        raise BagError(f"cannot read the bag '{path}': {error}; {remedy} saves what comes before") from error
 
 
 class _Robot:

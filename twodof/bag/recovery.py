@@ -114,6 +114,8 @@ def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]
     """
     between = not folder.exists() and (work / folder.name).is_dir()
     if not between and not folder.is_dir():
+        if folder.is_file() and folder.suffix in KINDS:
+            raise BagError(f"'{bag}' is a file; move it into a folder of its own, and recover that folder")
         whole, _, robot = str(bag).rpartition(":")
         if whole and robot and Path(whole).is_dir():
             raise BagError(f"there is no bag '{bag}'; 'twodof recover {whole}' repairs all its robots")
