@@ -134,10 +134,13 @@ def test_a_file_causes_a_limited_number_of_messages(tmp_path):
     done = run("plot", "bag", "-o", "plot.png", cwd=tmp_path)
     lines = done.stderr.splitlines()
     assert (done.returncode, len(lines)) == (0, MOST_MESSAGES)
-    assert lines[-1] == "WARNING: further messages are not shown"
+    assert lines[-1] == "WARNING: further messages of this minute are not shown"
 
 
 @pytest.mark.parametrize(("name", "value"), [("PYTHONOPTIMIZE", "2"), ("TMPDIR", ".")])
 def test_variables_of_python_end_no_run(name, value, native_path, tmp_path):
     done = run("run", str(native_path), "--stop-time", "0.1", "-o", "bag", cwd=tmp_path, **{name: value})
     assert (done.returncode, done.stderr) == (0, "")
+    for file, variables in (("a.fmu", {}), ("b.fmu", {name: value})):
+        assert run("build", "-o", file, cwd=tmp_path, **variables).returncode == 0
+    assert (tmp_path / "a.fmu").read_bytes() == (tmp_path / "b.fmu").read_bytes()  # with the same documentation

@@ -27,7 +27,9 @@ INPUTS = ("fmu", "urdf", "robot", "bag", "bags", "robots", "input")
 VERBS = (build, run, publish, layouts, check, info, linearise, fit, plot, view, live, page, sweep, export, recover)
 """The verbs in the order of the help, which has the first line of each docstring."""
 LONGEST_LINE = 2000
-MOST_MESSAGES = 50  # an untrusted file may cause thousands of warnings, for example of a font without its characters
+MOST_MESSAGES = (
+    50  # a minute; an untrusted file may cause thousands of warnings, for example of a font without its characters
+)
 
 
 def parser() -> tuple[Parser, dict[str, Parser]]:
@@ -66,14 +68,16 @@ class _Words(logging.Formatter):
 
 
 class _Few(logging.Filter):
-    """Log filter that passes a limited number of messages; the last one says so."""
+    """Log filter that passes a limited number of messages a minute; the last one says so."""
 
-    _count = 0
+    _count, _since = 0, -60.0
 
     def filter(self, record: logging.LogRecord) -> bool:
+        if record.created - self._since >= 60.0:  # a robot that is connected for days may cause more
+            self._count, self._since = 0, record.created
         self._count += 1
         if self._count == MOST_MESSAGES:
-            record.msg, record.args = "further messages are not shown", ()
+            record.msg, record.args = "further messages of this minute are not shown", ()
         return self._count <= MOST_MESSAGES
 
 

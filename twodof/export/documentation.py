@@ -1,10 +1,14 @@
 """Documentation folder of the FMU: equations, variables, provenance, requirements and licences."""
 
+import ast
 import hashlib
 import html
 import importlib.metadata
+import inspect
 from collections.abc import Sequence
 from string import Template
+from types import ModuleType
+from typing import cast
 
 from ..files import data_file
 from ..plant.plant import LAWS
@@ -23,6 +27,8 @@ def documentation(
 ) -> Files:
     """Return the files of the folder by their path in the FMU, which includes the URDF's text."""
     frame = html.escape(robot.frame)
+    source = inspect.getsource(cast(ModuleType, LAWS[options.control]))
+    law = ast.get_docstring(ast.parse(source))  # PYTHONOPTIMIZE=2 leaves out __doc__
     rows = []
     for v in table:
         cells = v.name, v.causality, v.unit, "" if v.start is None else v.start, v.description
@@ -36,7 +42,7 @@ def documentation(
         controller="outside" if options.control == "effort" else "inside",
         plant="outside" if options.part == "controller" else "inside",
         control=CONTROLS[options.control].title.format(frame=frame),
-        law=html.escape(str(LAWS[options.control].__doc__).strip()),
+        law=html.escape(str(law)),
         root=html.escape(robot.root),
         variables="\n".join(rows),
         fmi=flavour.fmi,
