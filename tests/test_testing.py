@@ -223,6 +223,20 @@ def test_a_bag_whose_name_is_not_text_has_a_plot_of_its_failure(runs, tmp_path, 
     assert "b\\xff" in page.read_text("utf-8")
 
 
+def test_a_plot_replaces_a_link_and_not_its_target(runs, tmp_path, monkeypatch):
+    """Others may have put links to any file into the folder of plots."""
+    kept, plot = tmp_path / "kept", tmp_path / "report" / "test_arm.py_test_late.html"
+    kept.write_text("kept")
+    plot.parent.mkdir()
+    plot.symlink_to(kept)
+    monkeypatch.setenv("PYTEST_CURRENT_TEST", "test_arm.py::test_late (call)")
+    monkeypatch.setattr("twodof.testing.assertions.REPORT", [plot.parent])
+    with pytest.raises(AssertionError, match="plot: "):
+        assert_settles(runs["good"], within=0.1)
+    assert kept.read_text() == "kept"
+    assert "<polyline" in plot.read_text() and not plot.is_symlink()
+
+
 def test_the_plugin_imports_nothing_heavy(tmp_path):
     (tmp_path / "test_light.py").write_text(
         "import sys\n\ndef test_light():\n    assert not {'numpy', 'fmpy', 'pinocchio', 'rosbags'} & {*sys.modules}\n"

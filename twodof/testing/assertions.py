@@ -148,9 +148,11 @@ def _fail(bag: Recording, text: str, curves: Sequence[Array], label: str = "") -
         name = re.sub(r"[^\w.-]+", "_", test)
         short = name if len(name) <= 100 else f"{name[:90]}_{crc32(test.encode()):08x}"
         path = REPORT[-1] / f"{short}.html"
-        path.parent.mkdir(parents=True, exist_ok=True)
         plot = picture(((bag.t, curve) for curve in curves), "t in s", label)
         page = f'<!DOCTYPE html><meta charset="utf-8">{card(test, {"bag": bag.path, "failure": text}, plot)}'
-        path.write_text(page, encoding="utf-8")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)  # it may be a link to any file
+        with path.open("x", encoding="utf-8") as file:
+            file.write(page)
         text += f"\nplot: {path}"
     raise AssertionError(f"'{bag.path}': {text}")
