@@ -76,7 +76,7 @@ def test_a_notebook_shows_progress_bars_of_long_tasks(native_path, tmp_path, sil
     assert (script.returncode, script.stderr) == (0, b"")
 
 
-@pytest.mark.parametrize(("tick", "shown"), [(0.05, True), (1e6, False)])
+@pytest.mark.parametrize(("tick", "shown"), [(0.001, True), (1e6, False)])
 def test_a_notebook_shows_a_line_of_a_slow_build(tmp_path, tick, shown):
     """It returns each text of the line, and the cell's output after the build; a script shows none."""
     begin = f"import os, twodof\nfrom twodof import notebook\nnotebook.TICK = {tick}"
