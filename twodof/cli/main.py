@@ -27,9 +27,7 @@ INPUTS = ("fmu", "urdf", "robot", "bag", "bags", "robots", "input")
 VERBS = (build, run, publish, layouts, check, info, linearise, fit, plot, view, live, page, sweep, export, recover)
 """The verbs in the order of the help, which has the first line of each docstring."""
 LONGEST_LINE = 2000
-MOST_MESSAGES = (
-    50  # a minute; an untrusted file may cause thousands of warnings, for example of a font without its characters
-)
+MOST_MESSAGES = 50  # a minute; a file may cause thousands, for example of a font without its characters
 
 
 def parser() -> tuple[Parser, dict[str, Parser]]:
