@@ -1,7 +1,7 @@
 """A verdict in words."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf
 
 import numpy as np
@@ -49,7 +49,8 @@ def lines_of(
     Args:
         together: errors of the run without all causes in words, or "".
     """
-    off = ", ".join(_distances(judge, numbers))
+    missed = missed_outputs(judge)
+    off = ", ".join(_distances(judge, numbers, missed))
     head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
     worst = worst_joint(judge)[1] if "final_joint_error" in numbers else ""
     parts = _parts(why)
@@ -75,7 +76,7 @@ def lines_of(
         *(text for text in also if NEXT in text),
         *notes,
         "" if any(cause.kind == "reach" for cause in why) else _remainder(parts),  # its distance is printed
-        _response(judge, outcome, motion, numbers, why),
+        _response(judge, outcome, motion, numbers, missed, why),
         _peaks(judge, why, outcome),
         settings,
     ]
@@ -173,7 +174,7 @@ def _settings(judge: Judge) -> str:
     return f"with {', '.join(texts)}" if texts else ""
 
 
-def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
+def _distances(judge: Judge, numbers: Mapping[str, float], missed: Sequence[str]) -> list[str]:
     """Return the errors at the end in words, those of missed outputs first."""
     texts = {}
     if "final_error" in numbers:
@@ -184,7 +185,6 @@ def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
     if "final_joint_error" in numbers:
         far, joint = worst_joint(judge)
         texts["q"] = f"joint errors of up to {far} ('{joint}')"
-    missed = missed_outputs(judge)
     return [texts[name] for name in sorted(texts, key=lambda name: name not in missed)]
 
 
@@ -195,7 +195,9 @@ def worst_joint(judge: Judge) -> tuple[str, str]:
     return f"{off[worst]:.3g} {judge.setup.units[worst]}".strip(), judge.setup.joints[worst]
 
 
-def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...]) -> str:
+def _response(
+    judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], missed: Sequence[str], why: tuple[Cause, ...]
+) -> str:
     """Return settling, overshoot, RMS error and motion in words."""
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
@@ -231,7 +233,7 @@ def _response(judge: Judge, outcome: str, motion: str, numbers: Mapping[str, flo
             parts.append(f"overshoot {100.0 * past:.3g} %" if past < MANY else f"the target is passed by {size}")
     elif outcome == "not reached":
         parts.append("the run starts at its target")
-    if "rms_error" in numbers and "x" in (missed_outputs(judge) or "x"):
+    if "rms_error" in numbers and (not missed or "x" in missed):
         parts.append(f"RMS error {numbers['rms_error']:.3g} m")
     if not parts and outcome == "no target":
         return ""
