@@ -30,35 +30,58 @@ static const double CUBIC[N_INCREMENTS + 1][4] = {
    this method is cheaper. */
 static const double STABLE = 3.3, WORTH = 12.0;
 
-/* The system (M + s D) x = τ at y, with joints at rest held. */
+/* The system (M + s D) x = τ at y, with joints at rest held: factors of M + s D = Lᵀ Δ L, with L in the lower triangle,
+   whose diagonal is Δ. Factorisation from the leaves to the root keeps the zeros between branches.
+
+   Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.5. */
 typedef struct {
-    double held[N_JOINTS], free[N_JOINTS], inertia[N_JOINTS];
-    JointPosition joint[N_BODIES];
-    EndBody end_body[N_LOADED];
+    int held[N_JOINTS];
+    double L[N_JOINTS][N_JOINTS];
 } DampedSystem;
 
 static void damped_system(const Step *step, double s, DampedSystem *system)
 {
     const double *value = step->plant->value;
+    double inertia[N_JOINTS], (*const L)[N_JOINTS] = system->L;
+    JointPosition joint[N_BODIES];
+    EndBody end_body[N_LOADED];
+    place_joints(step->y, joint);
+    body(value, 0, end_body);
     for (int i = 0; i < N_JOINTS; i++) {
-        const Rest held = step->stops.held[i];
-        system->held[i] = held != FREE;
-        system->free[i] = held == FREE || held == CLAMPED;
-        system->inertia[i] = value[ARMATURE + i] + (held == FREE ? s * value[DAMPING + i] : 0.0);
+        system->held[i] = step->stops.held[i] != FREE;
+        inertia[i] = value[ARMATURE + i] + (system->held[i] ? 0.0 : s * value[DAMPING + i]);
     }
-    place_joints(step->y, system->joint);
-    body(value, 0, system->end_body);
+    mass_matrix(joint, end_body, inertia, L);
+    for (int i = 0; i < N_JOINTS; i++)
+        for (int j = 0; j < i; j++)
+            if ((system->held[i] && step->stops.held[i] != CLAMPED)
+                || (system->held[j] && step->stops.held[j] != CLAMPED))
+                L[i][j] = 0.0; /* a clamped joint moves, as the other joints see it */
+    for (int k = N_JOINTS - 1; k > 0; k--)
+        for (int i = k - 1; i >= 0; i--)
+            if (L[k][i] != 0.0) {
+                const double factor = L[k][i] / L[k][k];
+                for (int j = 0; j <= i; j++)
+                    L[i][j] -= factor * L[k][j];
+                L[k][i] = factor;
+            }
 }
 
 /* x of the system for τ. */
 static void damped_motion(const DampedSystem *system, const double tau[N_JOINTS], double x[N_JOINTS])
 {
-    double given[N_JOINTS], reaction[N_JOINTS];
     for (int i = 0; i < N_JOINTS; i++)
-        given[i] = system->held[i] != 0.0 ? 0.0 : tau[i];
-    hybrid_dynamics(system->joint, system->end_body, system->inertia, system->free, given, x, reaction);
-    for (int i = 0; i < N_JOINTS; i++)
-        x[i] = system->held[i] != 0.0 ? 0.0 : x[i];
+        x[i] = system->held[i] ? 0.0 : tau[i];
+    for (int k = N_JOINTS - 1; k > 0; k--)
+        for (int i = 0; i < k; i++)
+            x[i] -= system->L[k][i] * x[k];
+    for (int k = 0; k < N_JOINTS; k++) {
+        x[k] /= system->L[k][k];
+        for (int i = 0; i < k; i++)
+            x[k] -= system->L[k][i] * x[i];
+    }
+    for (int k = 0; k < N_JOINTS; k++)
+        x[k] = system->held[k] ? 0.0 : x[k];
 }
 
 /* Solve (1 − s T) u = r in place, with the system for s = h γ. */
