@@ -1,12 +1,10 @@
-"""Write fitted numbers into a URDF, and keep its comments, order and all other text."""
+"""Write fitted numbers into the text of a URDF, in which nothing else changes."""
 
-import io
 import re
+import xml.etree.ElementTree as ET
 
-import lxml.etree
 import numpy as np
 
-from ..errors import InputError
 from ..plant.robot import inertial_pose
 from ..plant.urdf import INERTIA, Urdf
 from .inertials import inertia_of
@@ -14,6 +12,14 @@ from .parameters import Parameters, Values
 
 OF_DYNAMICS = ("friction", "damping")
 DIGITS = 9
+MARKUP = re.compile(
+    r"""<!--.*?-->|<!\[CDATA\[.*?]]>|<\?.*?\?>|</[^>]*>|(?P<start><[^\s/>]+(?:[^"'>]|"[^"]*"|'[^']*')*>)""", re.DOTALL
+)
+"""Comments, character data, processing instructions, end tags and start tags of a well-formed URDF."""
+ATTRIBUTE = re.compile(r"""([^\s=]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+
+Changes = dict[tuple[ET.Element, str], dict[str, str]]
+"""New values of attributes of the child with a tag, by its parent and tag."""
 
 
 def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -> bytes:
@@ -22,10 +28,9 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
     These are friction and damping of joints, and masses, centres and inertias of links. Joints that mimic each other
     share friction and damping in their original proportions.
     """
-    tree = parsed(text)
-    root = tree.getroot()
-    links = {link.get("name"): link for link in root.findall("link")}
-    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    inertials = {link.get("name"): link.find("inertial") for link in urdf.tree.findall("link")}
+    joints = {joint.get("name"): joint for joint in urdf.tree.findall("joint")}
+    changes: Changes = {}
     for free in parameters.free:
         if free.group in OF_DYNAMICS:
             leader = parameters.robot.joints[free.number]
@@ -34,51 +39,48 @@ def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -
                 own = getattr(joint, free.group)
                 share = own * after / before if before else after * (joint.name == leader)
                 if joint.moves and (share or own):
-                    _child(joints[joint.name], "dynamics").set(free.group, _number(share))
+                    changes.setdefault((joints[joint.name], "dynamics"), {})[free.group] = _number(share)
         elif free.group in ("mass", "com", "inertia"):
-            _write_link(links[parameters.links[free.number]].find("inertial"), free.group, free.number, values)
-    declaration = re.match(r"\ufeff?<\?xml.*?\?>\s*", text, re.DOTALL)
-    written = lxml.etree.tostring(tree, encoding="unicode")
-    return f"{declaration[0] if declaration else ''}{written.rstrip()}\n".encode()
+            inertial = inertials[parameters.links[free.number]]
+            assert inertial is not None  # free links have mass
+            changes |= _of_link(inertial, free.group, free.number, values)
+    return _edited(text, urdf.tree, changes).encode()
 
 
-def parsed(text: str) -> lxml.etree.ElementTree:
-    """Return the tree of a URDF, in which numbers can be replaced.
-
-    Raises:
-        InputError: libxml2 refuses the text; expat, which reads robots, accepts a little more.
-    """
-    parser = lxml.etree.XMLParser(encoding="utf-8", resolve_entities=False, no_network=True, huge_tree=False)
-    try:
-        return lxml.etree.parse(io.BytesIO(text.encode()), parser)
-    except lxml.etree.XMLSyntaxError as error:
-        raise InputError(f"the URDF cannot be written with fitted values: {error.msg}") from error
-
-
-def _write_link(inertial: lxml.etree.Element, group: str, link: int, values: Values) -> None:
-    place = inertial_pose(inertial)
+def _of_link(inertial: ET.Element, group: str, link: int, values: Values) -> Changes:
+    """Return the changes of a link's mass, centre of mass or inertia."""
     if group == "mass":
-        inertial.find("mass").set("value", _number(values.mass[link]))
-    elif group == "com":
-        _child(inertial, "origin", first=True).set("xyz", " ".join(map(_number, values.com[link])))
-    else:
-        R = place.rotation
-        tensor = R.T @ inertia_of(values.second[link]) @ R
-        for key, index in INERTIA.items():
-            inertial.find("inertia").set(key, _number(tensor[index]))
+        return {(inertial, "mass"): {"value": _number(values.mass[link])}}
+    if group == "com":
+        return {(inertial, "origin"): {"xyz": " ".join(map(_number, values.com[link]))}}
+    R = inertial_pose(inertial).rotation
+    tensor = R.T @ inertia_of(values.second[link]) @ R
+    return {(inertial, "inertia"): {key: _number(tensor[index]) for key, index in INERTIA.items()}}
 
 
-def _child(element: lxml.etree.Element, tag: str, *, first: bool = False) -> lxml.etree.Element:
-    """Return an element's child with a tag; if it is missing, make it with the indentation of the others."""
-    found = element.find(tag)
-    if found is None:
-        found = lxml.etree.Element(tag)
-        if len(element):
-            found.tail = element.text if first else element[-1].tail
-            if not first:
-                element[-1].tail = element.text
-        element.insert(0 if first else len(element), found)
-    return found
+def _edited(text: str, tree: ET.Element, changes: Changes) -> str:
+    """Return the text of a tree with changed attributes; a missing element becomes the first child of its parent."""
+    starts = (match for match in MARKUP.finditer(text) if match["start"])
+    tags = dict(zip(tree.iter(), starts, strict=True))
+    edits = list[tuple[int, int, str]]()
+    for (parent, tag), attributes in changes.items():
+        element = parent.find(tag)
+        if element is None:
+            end = tags[parent].end()
+            indentation = text[end : len(text) - len(text[end:].lstrip())]
+            words = "".join(f' {name}="{value}"' for name, value in attributes.items())
+            edits.append((end, end, f"{indentation}<{tag}{words}/>"))
+            continue
+        begin, end = tags[element].span()
+        known = {match[1]: match.span(match.lastindex or 0) for match in ATTRIBUTE.finditer(text, begin, end)}
+        after = begin + 1 + len(tag)
+        for name, value in attributes.items():
+            edits.append((*known[name], value) if name in known else (after, after, f' {name}="{value}"'))
+    parts, last = list[str](), 0
+    for begin, end, new in sorted(edits):
+        parts += text[last:begin], new
+        last = end
+    return "".join([*parts, text[last:]])
 
 
 def _number(value: float) -> str:

@@ -24,7 +24,7 @@ from .commanded import with_efforts
 from .curves import Comparison, compare
 from .estimate import NORMAL_95, PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
-from .fitted_urdf import fitted_urdf, parsed
+from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
 from .regression import regressors
 from .stretches import Array, Stretch, jumps, stretches
@@ -129,7 +129,6 @@ def fit(
     if output is not None:
         check_folder(output)
     model, gravity = read_model(urdf, free, **options), options.get("gravity")
-    parsed(model.text)  # so that a URDF that cannot be written is refused before the computation
     recordings = _recordings(bags)
     gravity = _recorded_gravity(recordings) if gravity is None else tuple(map(float, gravity))
     controller = _controller(model, gravity, options, settings or {})
