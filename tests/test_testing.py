@@ -72,6 +72,47 @@ def test_the_error_that_settles_last_is_named(tmp_path):
         assert_settles(tmp_path / "pose", within=3.3)
 
 
+def test_an_orientation_that_drifts_from_its_target_does_not_settle(tmp_path):
+    """The position settles; the last joint turns under an external effort, without a gain of the orientation."""
+    options = twodof.FmuOptions(
+        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
+    )
+    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "ur.fmu", options))
+    first = next(twodof.samples(fmu))
+    held = {"x_des": np.add(first.x, (0.0, 0.05, 0.0)), "quat_des": first.quat}
+    drifts = {"Kp_rot": (0.0,) * 3, "Kd_rot": (3.0,) * 3, "tau_ext[6]": 0.5}
+    verdict = twodof.run(fmu, twodof.Bag(tmp_path / "held"), stop_time=4.0, settings=held).verdict
+    assert verdict.outcome == "reached"
+    assert_settles(tmp_path / "held", within=verdict.numbers["settling_time"])
+    verdict = twodof.run(fmu, twodof.Bag(tmp_path / "drifts"), stop_time=4.0, settings=held | drifts).verdict
+    assert verdict.numbers["final_error"] < 0.02 * 0.05 and verdict.numbers["final_turn_error"] > 0.1
+    assert "the error of the orientation grew from 0 rad to" in str(verdict)
+    with pytest.raises(AssertionError, match=r"does not settle, .* its angle from the target orientation is"):
+        assert_settles(tmp_path / "drifts", within=4.0)
+
+
+def test_an_orientation_near_its_target_is_not_judged_by_its_rounding_error(tmp_path):
+    """At the second target the error of the orientation is 2e-7 rad, and at the end 5e-5 rad."""
+    options = twodof.FmuOptions(
+        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
+    )
+    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "ur.fmu", options))
+    first = next(twodof.samples(fmu))
+    goal = (Rotation.from_rotvec([0.0, 0.0, 0.2]) * Rotation.from_quat(first.quat)).as_quat()
+    fast = {"Kp": (50.0,) * 3, "Kd": (15.0,) * 3, "quat_des": goal, "x_des": np.add(first.x, (0.0, 0.05, 0.0))}
+    verdict = twodof.run(
+        fmu,
+        twodof.Bag(tmp_path / "two"),
+        stop_time=6.0,
+        settings=fast | {"Kp_rot": (40.0,) * 3, "Kd_rot": (13.0,) * 3},
+        changes=[(3.0, {"x_des": first.x, "tau_ext[6]": 1e-6})],
+    ).verdict
+    error = dict(twodof.read_bag(tmp_path / "two").errors())["quat"][1]
+    assert 1e-9 < error[300] < 1e-4 and error[-1] > error[300]
+    assert verdict.outcome == "reached" and verdict.numbers["settling_time"] < 3.0
+    assert_settles(tmp_path / "two", within=2.0)
+
+
 def test_a_limit_that_is_exceeded_is_named(tmp_path, native_path):
     twodof.run(native_path, twodof.Bag(tmp_path / "fast"), stop_time=0.3, settings={"v_start": (0.0, 30.0)})
     bag = twodof.read_bag(tmp_path / "fast")
@@ -79,6 +120,23 @@ def test_a_limit_that_is_exceeded_is_named(tmp_path, native_path):
     assert abs(bag.v[0, 1]) > limit
     with pytest.raises(AssertionError, match=f"v of joint 'joint2' is 30 at 0 s, its limit is {limit:g}"):
         assert_within_limits(bag)
+
+
+def test_a_limit_of_efforts_that_are_not_recorded_is_not_held(tmp_path):
+    robot = """<robot name="r"><link name="a"/><link name="b"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
+        <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j"
+        type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/><limit effort="0.5"/></joint></robot>"""
+    (tmp_path / "r.urdf").write_text(robot)
+    options = twodof.FmuOptions(urdf=tmp_path / "r.urdf", frame="b", control="joint", native=True)
+    fmu = twodof.build_fmu(tmp_path / "r.fmu", options)
+    for effort, message in (
+        (False, "no limit is known of its q, v: "),
+        (True, "tau of joint 'j' is .* its limit is 0.5"),
+    ):
+        bag = twodof.Bag(tmp_path / f"bag{effort}", effort=effort)
+        twodof.run(fmu, bag, stop_time=0.1, settings={"q_des": 2.0, "Kp": 500.0})
+        with pytest.raises(AssertionError, match=message):
+            assert_within_limits(bag.path)
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan")])
@@ -110,7 +168,7 @@ def test_incomparable_bags_fail(runs):
     good = twodof.read_bag(runs["good"])
     unknown = dataclasses.replace(good, provenance={})
     shorter = dataclasses.replace(good, stamps=good.stamps[:-1], q=good.q[:-1], v=good.v[:-1])
-    with pytest.raises(AssertionError, match="no limit is known"):
+    with pytest.raises(AssertionError, match="no limit is known of its q, v, tau"):
         assert_within_limits(unknown)
     with pytest.raises(AssertionError, match="the run cannot settle"):
         assert_settles(unknown, within=9.0)

@@ -6,10 +6,12 @@ from math import inf, nan
 import numpy as np
 
 from ..bounds import MAX_VALUE
+from .cause import FLOOR
 from .setup import Array
 
 BAND = 0.02  # band of the settling time, as a fraction of the initial error
 SMALLEST_MOVE = 1e-9  # m: a smaller move counts as a start at the target, without a settling time
+HELD = 1e-3  # m, rad: band of the settling time for an output that starts at its target
 
 
 class Aim:
@@ -17,20 +19,36 @@ class Aim:
 
     def __init__(self) -> None:
         self.squares = 0.0
-        self.began, self.outside, self.first, self.last, self.past = 0.0, -inf, nan, nan, 0.0
+        self.began, self.outside, self.strayed, self.first, self.last, self.past = 0.0, -inf, -inf, nan, nan, 0.0
         self.way: Array = np.empty(0)
 
     def begin(self, t: float, e: Array, size: float) -> None:
         """Start a move to a new target, from an error vector (empty for an angle) and its magnitude."""
-        self.began, self.outside, self.first, self.last, self.past, self.way = t, t, size, size, 0.0, e
+        self.began, self.outside, self.strayed = t, t, t
+        self.first, self.last, self.past, self.way = size, size, 0.0, e
 
     def add(self, t: Array, e: Array, size: Array) -> None:
         """Add N samples of the move."""
         if size.max() > BAND * self.first:
             self.outside = t[np.flatnonzero(size > BAND * self.first)[-1]]
+        if size.max() > HELD:
+            self.strayed = t[np.flatnonzero(size > HELD)[-1]]
         if self.way.size and SMALLEST_MOVE <= self.first < inf:
             self.past = max(self.past, -float((e @ self.way).min()) / self.first**2)
         self.last = float(size[-1])
+
+
+def moves(aims: Mapping[str, Aim]) -> set[str]:
+    """Return the outputs that move to their targets: the others start there, or much nearer than one that moves."""
+    firsts = {name: aim.first for name, aim in aims.items()}
+    least = FLOOR if max(firsts.values(), default=0.0) >= FLOOR else SMALLEST_MOVE
+    return {name for name, first in firsts.items() if first >= least}
+
+
+def unsettled(aims: Mapping[str, Aim]) -> set[str]:
+    """Return the outputs that end farther from their targets than settled ones do."""
+    moved = moves(aims)
+    return {name for name, aim in aims.items() if aim.last > (BAND * aim.first if name in moved else HELD)}
 
 
 def errors(name: str, now: Array, target: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..bounds import MAX_VALUE
 from ..plant.variables import EXACT as EXACT
-from .aim import BAND, SMALLEST_MOVE, Aim, errors, judgeable
+from .aim import Aim, errors, judgeable, moves, unsettled
 from .cause import MANY_CHANGES, Cause
 from .setup import Array, Setup
 
@@ -330,14 +330,13 @@ class Judge:
         if "q" in aims:
             off = np.abs(self.wanted("q") - self.end("q"))
             found["final_joint_error"] = float(off.max())
-        moved = [aim for aim in aims.values() if aim.first >= SMALLEST_MOVE]
-        ways = [aims[name].past for name in ("x", "q") if name in aims and aims[name] in moved]
+        moved = moves(aims)
+        ways = [aims[name].past for name in ("x", "q") if name in moved]
         if ways:
             found["overshoot"] = ways[0]
         if moved:
-            late = [aim.last > BAND * aim.first for aim in moved]
-            ends = [aim.outside + taken - aim.began for aim in moved]  # the sample after the last one outside the band
-            found["settling_time"] = inf if any(late) else max(ends)
+            outside = [(aim.outside if name in moved else aim.strayed) - aim.began for name, aim in aims.items()]
+            found["settling_time"] = inf if unsettled(aims) else max(outside) + taken  # the next sample is settled
         return found
 
 

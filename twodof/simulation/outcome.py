@@ -4,13 +4,12 @@ from math import inf
 
 import numpy as np
 
-from .aim import BAND
+from .aim import BAND, HELD
 from .cause import FLOOR
 from .judge import OF_THE_END, Judge
 
 SUCCESS = ("reached", "followed")
 """Words for a run whose outputs are all at their targets, or follow their moving targets."""
-HELD = 1e-3  # m, rad: a smaller error of an output that is held, and that only falls, is no failure
 FOLLOWED = 0.1  # fraction of the target's travel: with a larger RMS error in the second half, a target is not followed
 
 

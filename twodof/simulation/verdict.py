@@ -41,7 +41,7 @@ METRICS: Mapping[str, Metric] = {
         "settling time (2 %)",
         "s",
         "first t_k - t_0 from which on |e| stays within 2 % of |e_0|, and θ within 2 % of θ_0,"
-        " until the end of the run",
+        " until the end of the run; an output that starts at its target stays within 1e-3",
     ),
     "overshoot": Metric(
         "overshoot", "", "largest -e_k·d / |e_0|, the part of the way by which the target is passed; 0: not passed"

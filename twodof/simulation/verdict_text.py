@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 
-from .aim import SMALLEST_MOVE
+from .aim import moves, unsettled
 from .cause import FLOOR, MOTION, MOVING, SMALL, Cause, point_text
 from .controller_causes import STILL, controller_prefix, payloads
 from .judge import AT_LIMIT, Judge
@@ -201,29 +201,29 @@ def _response(
     """Return settling, overshoot, RMS error and motion in words."""
     parts, settling = [], numbers.get("settling_time")
     if outcome in ("reached", "not reached") and settling is not None:
-        moves = {name: aim for name, aim in judge.aims.items() if aim.first >= FLOOR} or judge.aims
-        units = {name: unit_of_error(judge, name) for name in moves}
+        moved = {name: aim for name, aim in judge.aims.items() if name in moves(judge.aims)}
+        late = {name: aim for name, aim in judge.aims.items() if name in unsettled(judge.aims)}
+        units = {name: unit_of_error(judge, name) for name in judge.aims}
         grown = [
             f"the error of the {ERRORS[name]} grew"
             + f" from {aim.first:.3g} {units[name]} to {aim.last:.3g} {units[name]}" * bool(units[name])
-            for name, aim in moves.items()
+            for name, aim in late.items()
             if aim.last > aim.first
         ]
         firsts = " and ".join(
             f"{aim.first:.3g} {units[name]}" + " over all joints" * (name == "q" and len(judge.setup.joints) > 1)
-            for name, aim in moves.items()
+            for name, aim in late.items()
             if units[name]
         )
-        late = ", ".join(grown) or "not within 2 % of the initial error" + f" of {firsts}" * bool(firsts)
-        moved = [ERRORS[name] for name, aim in judge.aims.items() if aim.first >= SMALLEST_MOVE]
-        only = f"{' and '.join(moved)} within 2 % only from {settling:.4g} s on"
+        away = ", ".join(grown) or "not within 2 % of the initial error" + f" of {firsts}" * bool(firsts)
+        only = f"{' and '.join(ERRORS[name] for name in moved)} within 2 % only from {settling:.4g} s on"
         within = only if outcome == "not reached" else f"within 2 % after {settling:.4g} s"
-        parts.append(late if settling == inf else within)
-        ends = {name: float(errors_at_the_end(judge, name).max(initial=0.0)) for name in units}
+        parts.append(away if settling == inf else within)
+        ends = {name: float(errors_at_the_end(judge, name).max(initial=0.0)) for name in moved}
         parts += [
             f"errors of the {ERRORS[name]} of up to {most:.3g} {units[name]} in the last tenth of the run"
             for name, most in ends.items()
-            if most > PASSING * max(moves[name].last, FLOOR) and units[name] and outcome == "not reached"
+            if most > PASSING * max(moved[name].last, FLOOR) and units[name] and outcome == "not reached"
         ]
         if "overshoot" in numbers and (numbers["overshoot"] or outcome == "reached"):
             past = numbers["overshoot"]
