@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 REPORT: list[Path] = []  # the report's folder, if any; the plugin appends it
+NO_MOVE = 1e-3  # m, rad: smaller initial errors are alike in the choice of the error that a failure shows
 EXACT = 1e-9  # tolerance relative to a limit, for a joint at its stop
 
 
@@ -55,14 +56,12 @@ def _latest_error(bag: Recording, within: float) -> tuple[str, Array, int]:
     """Return name, magnitudes and settling sample of the error that is largest relative to its first value."""
     import numpy as np
 
-    from ..simulation.aim import HELD
-
     found: list[tuple[float, str, Array, int]] = []
     for name, (target, size) in bag.errors().items():
         began = int(np.flatnonzero(np.append(True, np.diff(target, axis=0).any(axis=1)))[-1])
         k = min(int(bag.t.searchsorted(bag.t[began] + within)), len(size) - 1)
         what = "its angle from the target orientation" if name == "quat" else "its error"
-        found.append((size[k:].max() / max(size[began], HELD), what, size, k))
+        found.append((size[k:].max() / max(size[began], NO_MOVE), what, size, k))
     return max(found, key=lambda each: each[0])[1:]
 
 
