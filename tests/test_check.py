@@ -20,7 +20,7 @@ from tools import needs
 
 import twodof
 from twodof.cli.main import main
-from twodof.errors import InputError
+from twodof.errors import ChildError, InputError
 from twodof.fmu import Instance, checking, instantiate, load_any_fmu
 from twodof.fmu.description import problems_of
 from twodof.fmu.trials import TRIALS
@@ -50,6 +50,14 @@ DISCRETE = """<ScalarVariable name="k" valueReference="7" causality="input" vari
 <Integer start="3" max="3"/></ScalarVariable>
 <ScalarVariable name="b" valueReference="8" causality="parameter" variability="fixed"><Boolean start="false"/>
 </ScalarVariable></ModelVariables>"""
+TYPED = """<ScalarVariable name="item" valueReference="11" causality="input" variability="discrete">
+<Enumeration declaredType="E" start="2"/></ScalarVariable>
+<ScalarVariable name="text" valueReference="12" causality="parameter" variability="fixed">
+<String start="text"/></ScalarVariable><ScalarVariable name="z" valueReference="8" causality="output"><Real/>
+</ScalarVariable><ScalarVariable name="c" valueReference="13" causality="output" variability="discrete"><Boolean/>
+</ScalarVariable>
+</ModelVariables>"""
+ITEMS = '<Item name="a" value="2"/><Item name="b" value="1"/>'
 ALSO_INDEX = '<Unknown index="4"/>', '<Unknown index="4"/><Unknown index="6"/>'
 MODEL_EXCHANGE = re.sub("<CoSimulation.*?/>", '<ModelExchange modelIdentifier="F"/>', DESCRIPTION, flags=re.DOTALL)
 MORE = """<ScalarVariable name="t" valueReference="9" causality="independent"><Real/></ScalarVariable>
@@ -114,9 +122,21 @@ ALSO = {
     "LOSES_TUNABLE": ("serialised state",),
     "LOSES_INTEGER": ("serialised state",),
     "CRASHES": ("serialised state",),
-    "COUNTS": ("simulation", "two instances", "state", "serialised state"),
+    "COUNTS": ("simulation", "two instances", "state", "serialised state", "derivatives"),
 }
 OF_OTHER_KINDS = "KEEPS_INTEGER", "KEEPS_BOOLEAN", "LOSES_TUNABLE", "LOSES_INTEGER"
+OF_MORE_TYPES = {
+    "NONE": (set(), ""),
+    "ONE_STATE": ({*STATES}, "at the restored state: y is"),
+    "NOT_FINITE_AT_START": ({"simulation"}, "y is nan after 0 steps"),
+    "SMALL_SLOPE": ({"derivatives"}, "∂z/∂u is 1e-08, and it gives 5e-08"),
+    "WRONG_TEXT": ({"start values"}, "text is 'wrong' before it is set, and its start value is 'text'"),
+    "WRONG_ITEM": ({"start values"}, "item is 1 before it is set, and its start value is 2"),
+    "KEEPS_TEXT": ({"reset"}, "text is 'text_' after a reset, and its start value is 'text'"),
+    "LOSES_ITEM": ({*STATES}, "at the restored state: y is"),
+    "READS_TWO": ({"simulation"}, "c is 2 after 0 steps"),
+    "DERIVATIVES_STEER": ({"derivatives"}, "after directional derivatives: y is"),
+}
 REMARK = "it accepts the end of an initialisation that was not begun, a step of a negative size, a step from another"
 
 
@@ -192,6 +212,61 @@ def test_a_fault_fails_its_row_in_both_versions(fault: str, description: str, tm
     rows, text = OF_BOTH_VERSIONS.get(fault, (set(), ""))
     assert {*found} >= rows and all(found[row].startswith(text) for row in rows), found
     assert fault in ("READS_STEER", "WRONG_TIME") or {*found} == rows
+
+
+def typed(dependencies: str = "") -> str:
+    """Return the description with inputs, parameters and outputs of more types."""
+    types = f'<TypeDefinitions><SimpleType name="E"><Enumeration>{ITEMS}</Enumeration></SimpleType></TypeDefinitions>'
+    described = DESCRIPTION.replace("</ModelVariables>", TYPED).replace("<DefaultExp", f"{types}<DefaultExp")
+    known = f'<Unknown index="8"/><Unknown index="9"{dependencies}/>'
+    for end in ("</Outputs>", "</InitialUnknowns>"):
+        described = described.replace(end, known + end)
+    return described
+
+
+@pytest.mark.parametrize("fault", OF_MORE_TYPES)
+def test_a_fault_of_more_types_fails_its_row(fault: str, tmp_path: Path) -> None:
+    """FMI 2.0.5, sections 2.1.3 to 2.1.9 and 2.2.7."""
+    rows, text = OF_MORE_TYPES[fault]
+    found = failed(twodof.check(foreign(tmp_path, fault, typed())))
+    assert {*found} >= rows and all(found[row].startswith(text) for row in rows), found
+    assert rows or not found, found
+
+
+def test_an_undeclared_dependency_on_a_discrete_real_input_fails(tmp_path: Path) -> None:
+    described = DESCRIPTION.replace('causality="input"', 'causality="input" variability="discrete"')
+    described = described.replace('<Unknown index="4"/>', '<Unknown index="4" dependencies="2"/>')
+    texts = failed(twodof.check(foreign(tmp_path, description=described)))
+    assert texts == {"inputs": "y depends on u, and its InitialUnknown does not declare it"}
+
+
+@pytest.mark.parametrize("output", ["c", "y"])
+def test_undeclared_dependencies_of_and_on_discrete_variables_fail(output: str, tmp_path: Path) -> None:
+    """A Boolean depends on a real input, or a real output on an enumeration."""
+    described = typed(' dependencies="2"' if output == "c" else ' dependencies="1"')
+    if output == "y":
+        described = described.replace('<Unknown index="4"/>', '<Unknown index="4" dependencies="1 2"/>')
+    found = failed(twodof.check(foreign(tmp_path, "LOSES_ITEM" if output == "y" else "NONE", described)))
+    on = "item" if output == "y" else "u"
+    assert found["inputs"] == f"{output} depends on {on}, and its InitialUnknown does not declare it"
+
+
+@pytest.mark.parametrize("fault", ["NONE", "WRONG_TEXT", "WRONG_ITEM", "KEEPS_TEXT"])
+def test_start_values_of_more_types_of_fmi_3_are_compared(fault: str, tmp_path: Path) -> None:
+    more = '<UInt8 name="item" valueReference="11" causality="parameter" variability="fixed" start="2"/>'
+    more += '<String name="text" valueReference="12" causality="parameter" variability="fixed"><Start value="text"/>'
+    described = DESCRIPTION_3.replace("</ModelVariables>", f"{more}</String></ModelVariables>")
+    found = failed(twodof.check(foreign(tmp_path, fault, described)))
+    rows, text = OF_MORE_TYPES[fault]
+    assert {*found} >= rows and all(found[row].startswith(text) for row in rows), found
+    assert rows or not found, found
+
+
+def test_a_process_that_does_not_start_is_no_fault_of_the_fmu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = foreign(tmp_path)
+    monkeypatch.setattr(checking, "MAX_START_WAIT", 0.001)
+    with pytest.raises(ChildError, match=r"did not start within 0.001 s: Killed; repeat the check when this machine"):
+        twodof.check(path)
 
 
 @pytest.mark.parametrize("description", [DESCRIPTION, DESCRIPTION_3], ids="23")

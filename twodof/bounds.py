@@ -26,6 +26,7 @@ MAX_WIRING = 1_000_000  # connections on the paths of all values of a system, an
 MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB
 MAX_SOURCES = 128 * MIB  # C files that are compiled for a page; those of a Panda have 11 MiB
+MAX_START_WAIT = 600  # s of wall time, the imports of a process that checks an FMU
 MAX_CALL_WAIT = 60  # s of wall time, one call of an FMU under check
 MAX_CHECK_MEMORY = 4096 * MIB  # address space of an FMU under check; a Python FMU takes 0.5 GiB, more on many cores
 MAX_REFERENCES = 16 * MIB  # reference files in an FMU; a file counts for each time that it is read

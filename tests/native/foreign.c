@@ -11,21 +11,27 @@ enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES,
        KEEPS_INPUT, KEEPS_PARAMETER, ONE_SEED, DISCARDS_LARGE, HIGH, UNSET,
        RESTORES_NO_INPUT, BOUNDED, POINTS, ENDS, NAMED, OLD_SLOPE, SHARES_PARAMETER,
        KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER, FLUSHES,
-       DESTROYS, READS_STEER, NOT_EXACT, NOT_CONSTANT, WRONG_TIME, KEEPS_HANDLE, LEAVES_POINTER };
+       DESTROYS, READS_STEER, NOT_EXACT, NOT_CONSTANT, WRONG_TIME, KEEPS_HANDLE, LEAVES_POINTER,
+       ONE_STATE, NOT_FINITE_AT_START, SMALL_SLOPE, WRONG_TEXT, WRONG_ITEM, KEEPS_TEXT, LOSES_ITEM, READS_TWO,
+       DERIVATIVES_STEER };
 #ifndef X
 #define X 1.0
 #endif
-typedef struct { double u, x, p; int phase; double t; int k, b, reads; } M;
+typedef struct { double u, x, p; int phase; double t; int k, b, reads, item; char text[16]; } M;
+static M one;
 static double shared;
 static int count, living;
 static double shared_p, flushed;
 static char names[8][80];
 static M *owners[8];
-static void start(M *m) { *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0, 0.0, 3, 0}; }
+static void start(M *m) {
+    *m = (M){0.0, X, FAULT == UNSET ? NAN : 1.0, 0, 0.0, 3, 0, 0, FAULT == WRONG_ITEM ? 1 : 2};
+    strcpy(m->text, FAULT == WRONG_TEXT ? "wrong" : "text");
+}
 static double y_of(M *m) {
     return (FAULT == SHARES ? shared : m->x) + (FAULT == OLD_SLOPE ? 2.0 + 10.0 * m->t : 2.0) * m->u
         + (FAULT == HIGH ? 1e6 : 0.0) + (FAULT == SHARES_PARAMETER ? shared_p : FAULT == LOSES_TUNABLE ? m->p : 0.0)
-        + (FAULT == LOSES_INTEGER ? m->k : 0);
+        + (FAULT == LOSES_INTEGER ? m->k : FAULT == LOSES_ITEM ? m->item : 0);
 }
 
 fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
@@ -57,6 +63,7 @@ fmi2Status fmi2Reset(fmi2Component c) {
     if (FAULT == KEEPS_PARAMETER) ((M *)c)->p = old.p;
     if (FAULT == KEEPS_INTEGER) ((M *)c)->k = old.k;
     if (FAULT == KEEPS_BOOLEAN) ((M *)c)->b = old.b;
+    if (FAULT == KEEPS_TEXT) memcpy(((M *)c)->text, old.text, sizeof old.text);
     return fmi2OK;
 }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return ((M *)c)->phase ? fmi2Error : fmi2OK; }
@@ -77,8 +84,9 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, fmi2Real v[]) {
     M *m = c;
     for (size_t i = 0; i < n; i++) {
+        int defined = FAULT != (m->t > 0.0 ? NOT_FINITE : NOT_FINITE_AT_START);
         double value[] = {0.0, m->u, FAULT == NOT_EXACT ? m->x + 0.5 : m->x, m->u - m->x,
-                          FAULT == NOT_FINITE ? NAN : y_of(m), m->p, 0.0, 0.0, 0.0,
+                          defined ? y_of(m) : NAN, m->p, 0.0, 0.0, 1e-8 * m->u,
                           FAULT == WRONG_TIME ? 1.01 * m->t : m->t, FAULT == NOT_CONSTANT ? 9.8 : 9.81};
         if (r[i] > 10 && FAULT == FRAGILE) abort();
         if (r[i] > 10) return fmi2Error;
@@ -102,6 +110,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
 }
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) {
     if (*s && FAULT == KEEPS_HANDLE) return fmi2OK;
+    if (FAULT == ONE_STATE) *s = &one;
     if (!*s) *s = malloc(sizeof(M));
     *(M *)*s = *(M *)c;
     return fmi2OK;
@@ -110,16 +119,17 @@ fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
     if (FAULT == CRASHES) abort();
     if (FAULT == FLUSHES && ((M *)s)->t < flushed) return fmi2Error;
     double u = ((M *)c)->u, p = ((M *)c)->p;
-    int k = ((M *)c)->k;
+    int k = ((M *)c)->k, item = ((M *)c)->item;
     if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;
     if (FAULT == DESTROYS) ((M *)s)->x = 0.0;
     if (FAULT == RESTORES_NO_INPUT) ((M *)c)->u = u;
     if (FAULT == LOSES_TUNABLE) ((M *)c)->p = p;
     if (FAULT == LOSES_INTEGER) ((M *)c)->k = k;
+    if (FAULT == LOSES_ITEM) ((M *)c)->item = item;
     return fmi2OK;
 }
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *s) {
-    free(*s);
+    if (FAULT != ONE_STATE) free(*s);
     if (FAULT != LEAVES_POINTER) *s = NULL;
     return fmi2OK;
 }
@@ -130,7 +140,7 @@ fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate s, fmi2Byte b[], 
     return fmi2OK;
 }
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte b[], size_t n, fmi2FMUstate *s) {
-    *s = malloc(n);
+    *s = FAULT == ONE_STATE ? &one : malloc(n);
     if (FAULT == POINTS) memcpy(&b, b, sizeof(void *));
     for (size_t i = 0; i < n; i++) ((char *)*s)[i] = FAULT == LOSES_BYTES && i >= sizeof(double) ? 0 : b[i];
     ((M *)*s)->phase = 1;
@@ -142,9 +152,12 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
         dz[i] = 0.0;
         for (size_t k = 0; k < (FAULT == ONE_SEED ? 1 : nv); k++) {
             double of_y = v[k] == 1 ? 2.0 : 1.0, of_rate = v[k] == 1 ? 1.0 : -1.0;
-            dz[i] += dv[k] * (z[i] == 4 ? of_y * (FAULT == WRONG_SLOPE ? 1.00001 : 1.0) : of_rate);
+            double of_z = v[k] == 1 ? FAULT == SMALL_SLOPE ? 5e-8 : 1e-8 : 0.0;
+            of_y *= FAULT == WRONG_SLOPE ? 1.00001 : 1.0;
+            dz[i] += dv[k] * (z[i] == 8 ? of_z : z[i] == 4 ? of_y : of_rate);
         }
     }
+    if (FAULT == DERIVATIVES_STEER && ((M *)c)->t > 0.0) ((M *)c)->x += 0.1;
     return fmi2OK;
 }
 
@@ -157,18 +170,24 @@ const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
 typedef const fmi2ValueReference R[];
 fmi2Status fmi2GetInteger(fmi2Component c, R r, size_t n, fmi2Integer v[]) {
-    v[0] = r[0] == 6 ? ++count : ((M *)c)->k;
+    v[0] = r[0] == 6 ? ++count : r[0] == 11 ? ((M *)c)->item : ((M *)c)->k;
     return fmi2OK;
 }
-fmi2Status fmi2GetBoolean(fmi2Component c, R r, size_t n, fmi2Boolean v[]) { v[0] = ((M *)c)->b; return fmi2OK; }
+fmi2Status fmi2GetBoolean(fmi2Component c, R r, size_t n, fmi2Boolean v[]) {
+    v[0] = r[0] == 13 ? FAULT == READS_TWO ? 2 : ((M *)c)->u > 5e-5 : ((M *)c)->b;
+    return fmi2OK;
+}
 fmi2Status fmi2SetInteger(fmi2Component c, R r, size_t n, const fmi2Integer v[]) {
     if (v[0] > 3) return fmi2Error;
-    ((M *)c)->k = v[0];
+    *(r[0] == 11 ? &((M *)c)->item : &((M *)c)->k) = v[0];
     return fmi2OK;
 }
 fmi2Status fmi2SetBoolean(fmi2Component c, R r, size_t n, const fmi2Boolean v[]) { ((M *)c)->b = v[0]; return fmi2OK; }
-NOT_THERE(fmi2GetString, R r, size_t n, fmi2String v[])
-NOT_THERE(fmi2SetString, R r, size_t n, const fmi2String v[])
+fmi2Status fmi2GetString(fmi2Component c, R r, size_t n, fmi2String v[]) { v[0] = ((M *)c)->text; return fmi2OK; }
+fmi2Status fmi2SetString(fmi2Component c, R r, size_t n, const fmi2String v[]) {
+    snprintf(((M *)c)->text, sizeof ((M *)c)->text, "%s", v[0]);
+    return fmi2OK;
+}
 NOT_THERE(fmi2SetRealInputDerivatives, R r, size_t n, const fmi2Integer o[], const fmi2Real v[])
 NOT_THERE(fmi2GetRealOutputDerivatives, R r, size_t n, const fmi2Integer o[], fmi2Real v[])
 NOT_THERE(fmi2CancelStep)

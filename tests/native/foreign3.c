@@ -21,6 +21,10 @@ fmi3Status fmi3ExitInitializationMode(I) { return (fmi3Status)fmi2ExitInitializa
 fmi3Status fmi3Terminate(I) { return (fmi3Status)fmi2Terminate(c); }
 fmi3Status fmi3SetFloat64(I, AT, const fmi3Float64 v[], size_t m) { return (fmi3Status)fmi2SetReal(c, r, n, v); }
 fmi3Status fmi3GetFloat64(I, AT, fmi3Float64 v[], size_t m) { return (fmi3Status)fmi2GetReal(c, r, n, v); }
+fmi3Status fmi3GetString(I, AT, fmi3String v[], size_t m) { return (fmi3Status)fmi2GetString(c, r, n, v); }
+fmi3Status fmi3SetString(I, AT, const fmi3String v[], size_t m) { return (fmi3Status)fmi2SetString(c, r, n, v); }
+fmi3Status fmi3GetUInt8(I, AT, fmi3UInt8 v[], size_t m) { v[0] = ((M *)c)->item; return fmi3OK; }
+fmi3Status fmi3SetUInt8(I, AT, const fmi3UInt8 v[], size_t m) { ((M *)c)->item = v[0]; return fmi3OK; }
 fmi3Status fmi3DoStep(I, fmi3Float64 t, fmi3Float64 h, fmi3Boolean final, fmi3Boolean *event, fmi3Boolean *ends,
                       fmi3Boolean *early, fmi3Float64 *last) {
     *event = *ends = *early = false;

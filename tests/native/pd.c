@@ -4,7 +4,7 @@
 
 #include "fmi2FunctionTypes.h"
 
-enum { N = 2, Q = 0, V = N, Q_DES = 2 * N, TAU = 3 * N, KP = 4 * N, KD, MOST = 20 };
+enum { N = 2, Q = 0, V = N, Q_DES = 2 * N, TAU = 3 * N, KP = 4 * N, KD, MOST = 20, MODE = 71 };
 
 typedef struct {
     double value[KD + 1];
@@ -73,17 +73,16 @@ fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t
 
 fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer value[])
 {
-    (void)vr;
-    if (n > 0)
-        ((Controller *)c)->seen = value[0];
+    for (size_t i = 0; i < n; i++)
+        if (vr[i] != MODE)
+            ((Controller *)c)->seen = value[i];
     return fmi2OK;
 }
 
 fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Integer value[])
 {
-    (void)vr;
     for (size_t i = 0; i < n; i++)
-        value[i] = ((Controller *)c)->steps;
+        value[i] = vr[i] == MODE ? 1 : ((Controller *)c)->steps;
     return fmi2OK;
 }
 

@@ -14,11 +14,14 @@ WHOLE = {f"Int{bits}": range(-(2 ** (bits - 1)), 2 ** (bits - 1)) for bits in (8
 WHOLE |= {f"UInt{bits}": range(2**bits) for bits in (8, 16, 32, 64)}
 WHOLE |= {"Integer": WHOLE["Int32"], "Enumeration": WHOLE["Int64"]}
 """Ranges of the integer types."""
+DISCRETE = {"Boolean", "String", *WHOLE}
+"""Types of variables that are no real numbers."""
 LARGEST = {"Real": sys.float_info.max, "Float32": 3.4028234663852886e38}
 """Largest magnitude of each type of real numbers."""
+IN_FMI_2 = {**{kind: kind for kind in ("Real", "Integer", "Boolean", "String")}, "Enumeration": "Integer"}
 IN_FMI_3 = {kind: kind for kind in ("Float32", "Boolean", "String", *WHOLE)}
 IN_FMI_3 |= {"Real": "Float64", "Integer": "Int32", "Enumeration": "Int64"}
-"""Names in calls of FMI 3.0 for each type."""
+"""Names in calls of FMI 2.0 and 3.0 for each type."""
 
 
 class Type(NamedTuple):

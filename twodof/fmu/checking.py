@@ -12,9 +12,9 @@ from pathlib import Path
 from subprocess import DEVNULL
 from typing import NamedTuple
 
-from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_DESCRIPTIONS, MAX_ROW, MIN_STEP
+from ..bounds import MAX_CALL_WAIT, MAX_CHECK_MEMORY, MAX_DESCRIPTIONS, MAX_ROW, MAX_START_WAIT, MIN_STEP
 from ..children import Child, limit
-from ..errors import FmuError, InputError, SspError
+from ..errors import ChildError, FmuError, InputError, SspError
 from ..export.package import has_member
 from ..files import parsed, temporary_folder
 from ..notebook import card
@@ -84,6 +84,7 @@ def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
         tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos", "fmuloader" or "pathsim".
 
     Raises:
+        ChildError: this machine cannot start the child process, or not within MAX_START_WAIT.
         FmuError: the file is missing, is not an FMU, is unsafe to unzip, or has no co-simulation.
         InputError: a tool is not installed, or the FMU contains no references for it.
     """
@@ -165,23 +166,27 @@ def _runs(fmu: Fmu, tools: Sequence[str]) -> list[_Task]:
 def _tried(fmu: Fmu, tasks: Sequence[_Task]) -> Iterator[Row]:
     """Yield the row of each trial; after a crash, a new process does the remaining trials.
 
-    A crash at a call that the standard forbids is a remark, because the FMU need not detect it.
+    A crash at a call that the standard forbids is a remark, because the FMU need not detect it. The start of a process
+    calls no FMU.
     """
     waiting = [*tasks]
     while waiting:
-        doing = "its start"
+        doing = ""
         with (
             temporary_folder() as folder,
             Child(_serve, fmu.path.absolute(), fmu.inside, waiting, folder, output=DEVNULL) as child,
         ):
             try:
                 while waiting:
-                    kind, *words = parsed(child.receive(MAX_ROW, MAX_CALL_WAIT))
+                    kind, *words = parsed(child.receive(MAX_ROW, MAX_CALL_WAIT if doing else MAX_START_WAIT))
                     if kind == "row":
                         yield Row(waiting.pop(0).name, *words)
                     else:
                         (doing,) = words
             except (EOFError, ValueError, TypeError) as end:  # an FMU can write what it likes
+                if not doing:
+                    what = f"the process that checks it did not start within {MAX_START_WAIT} s: {end}"
+                    raise ChildError(f"'{fmu.path}': {what}; repeat the check when this machine is less busy") from end
                 limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
                 outcome = "remark" if doing.startswith(FORBIDDEN) else "failed"
                 yield Row(waiting.pop(0).name, outcome, f"it ended its process at: {doing}{limit}: {end}")
@@ -199,6 +204,7 @@ def _serve(pipe: Connection, path: Path, inside: str, tasks: Sequence[_Task], fo
     trial = Trial(load_any_fmu(path, inside), lambda what: send("note", what))
 
     references: dict[str, Reference] = {}
+    trial.note("its first trial")
 
     def result(task: _Task) -> str:
         if task.trial in TRIALS:

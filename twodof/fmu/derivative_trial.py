@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +16,11 @@ from .trial import DELTA, Trial, UnpassedError
 PART = 0.37  # fraction of a step, after which a sampled controller takes no sample
 MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
 SMOOTH, EXACT = 1e-3, 1e-7
-"""A derivative is compared if the quotients of two widths differ by at most SMOOTH. The tolerance is this difference
-plus EXACT. Both are relative to the derivative's magnitude or to 1.
+"""A derivative is compared if the quotients of two widths differ by at most SMOOTH, relative to the derivative's
+magnitude or to 1. The tolerance is this difference, plus EXACT relative to the derivative's magnitude, plus the effect
+of rounding.
 """
-ULPS = 8.0  # spacings of numbers by which an output may be rounded
+ULPS = 32.0  # spacings of numbers by which an output may be rounded, at the magnitude of its terms or its nominal value
 Array = NDArray[np.float64]
 
 
@@ -34,18 +36,13 @@ class Slopes(NamedTuple):
     doubt: Array
 
     @property
-    def scale(self) -> Array:
-        """Magnitudes that tolerances are relative to."""
-        return np.maximum(1.0, np.abs(self.best))
-
-    @property
     def smooth(self) -> NDArray[np.bool_]:
         """True where the two quotients agree; elsewhere there is a jump."""
-        return self.doubt <= SMOOTH * self.scale
+        return self.doubt <= SMOOTH * np.maximum(1.0, np.abs(self.best))
 
     def differ(self, given: Array) -> NDArray[np.bool_]:
         """Return where derivatives differ from the quotients."""
-        return self.smooth & ~(np.abs(given - self.best) <= self.doubt + EXACT * self.scale)
+        return self.smooth & ~(np.abs(given - self.best) <= self.doubt + EXACT * np.abs(self.best))
 
 
 class Point:
@@ -53,6 +50,7 @@ class Point:
 
     Attributes:
         values: the point, by the names of the knowns.
+        sizes: magnitudes of the unknowns, at least their nominal values, which are 1 if not stated.
     """
 
     def __init__(self, trial: Trial) -> None:
@@ -66,6 +64,13 @@ class Point:
         self._widths = dict([*widths.items()][:MOST_KNOWNS])
         self.values = {name: trial.inside(name, 2.0 * width) for name, width in self._widths.items()}
         self.unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
+        nominals = (float(trial.variables[name].nominal or 1.0) for name in self.unknowns)
+        self.sizes = np.array([abs(size) if size and isfinite(size) else 1.0 for size in nominals])
+
+    def measure(self, stated: Array) -> None:
+        """Set the magnitudes of the unknowns at least to those of the terms of which they consist."""
+        terms = np.abs(stated) @ [max(1.0, abs(value)) for value in self.values.values()]
+        self.sizes = np.fmax(self.sizes, np.where(np.isfinite(terms), terms, 0.0))
 
     def keep_inside(self, instance: Instance) -> None:
         """Move states that a parameter bounds below their start values, and leave out those that cannot change."""
@@ -90,7 +95,7 @@ class Point:
             change({name: self.values[name] + delta})
             row[:] = read()
         wide, narrow = (higher - lower) / (2.0 * width), (high - low) / width
-        rounding = ULPS * np.spacing(np.abs(rows).max(axis=0)) / width
+        rounding = ULPS * np.spacing(np.maximum(self.sizes, np.abs(rows).max(axis=0))) / width
         return Slopes((4.0 * narrow - wide) / 3.0, np.abs(narrow - wide) + rounding)
 
     def go_on(self, instance: Instance, steps: int = 0) -> None:
@@ -119,13 +124,23 @@ class Point:
         return np.asarray((np.array(read()) == before) & (reads_state()[0] != at))
 
 
+def _given(trial: Trial, instance: Instance, point: Point, knowns: Sequence[str]) -> Array:
+    """Return the FMU's derivatives; raise if an output changes because they are read."""
+    read = trial.reader(instance)
+    before = read()
+    trial.note("directional derivatives")
+    found = instance.derivatives(point.unknowns, knowns)
+    trial.compare([before], [read()], "after directional derivatives")
+    return found
+
+
 def _check_sum(instance: Instance, point: Point, stated: Array) -> None:
     """Compare the derivative along all knowns with the sum of those along each."""
     seed = {name: 1.0 + k % 7 for k, name in enumerate(point.values)}
     parts = stated * [*seed.values()]
-    total, scale = parts.sum(axis=1), np.maximum(1.0, np.abs(parts).sum(axis=1))
-    found = instance.directional(point.unknowns, seed)
-    wrong = np.isfinite(total) & ~(np.abs(found - total) <= EXACT * scale)
+    total, found = parts.sum(axis=1), instance.directional(point.unknowns, seed)
+    tolerance = EXACT * np.abs(parts).sum(axis=1) + ULPS * np.spacing(point.sizes) / DELTA
+    wrong = np.isfinite(total) & ~(np.abs(found - total) <= tolerance)
     if wrong.any():
         k = int(wrong.argmax())
         what = f"the derivative of {point.unknowns[k]} with a seed of several variables"
@@ -138,7 +153,7 @@ def _check_later(trial: Trial, instance: Instance, point: Point) -> None:
     steps = trial.steps - 1
     trial.begin_again(instance, point.values)
     point.go_on(instance, steps)
-    for given, name in zip(instance.derivatives(point.unknowns, names).T, names):
+    for given, name in zip(_given(trial, instance, point, names).T, names):
         slopes = point.slopes(instance, name, instance.set)
         instance.set({name: point.values[name]})
         wrong = slopes.differ(given) & (slopes.best != 0.0)
@@ -161,8 +176,8 @@ def derivatives(trial: Trial) -> str:
     with trial.instance(point.values) as instance:
         point.keep_inside(instance)
         trial.begin_again(instance, point.values)
-        trial.note("directional derivatives")
-        stated = instance.derivatives(point.unknowns, [*point.values])
+        stated = _given(trial, instance, point, [*point.values])
+        point.measure(stated)
         _check_sum(instance, point, stated)
 
         def at_start(values: Mapping[str, float]) -> None:

@@ -9,11 +9,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, choice
+from ..errors import InputError, SimulationError, choice
 from .description import Fmu
 from .reference_runs import KINDS, Reference, Values
 from .system_instance import instantiate_fmu
-from .trial import UnpassedError
 
 Rows = NDArray[np.float64]
 T = TypeVar("T")
@@ -125,7 +124,7 @@ def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
     from fmuloader.fmi2 import Fmi2Slave, Fmi2Type
 
     if fmu.description.modelExchange is None:
-        raise UnpassedError("does not apply", "fmuloader runs only FMUs that have Model Exchange too")
+        raise SimulationError("not run with fmuloader: it runs only FMUs that have Model Exchange too")
     slave = Fmi2Slave(str(fmu.path), model_identifier=fmu.description.coSimulation.modelIdentifier)
     slave.instantiate("fmu", Fmi2Type.CO_SIMULATION, guid=fmu.guid)
     write = _by_type(fmu, slave.set_real, slave.set_integer, slave.set_boolean)
@@ -155,7 +154,7 @@ def in_pathsim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
 
     inputs = {name: v.start_value for name, v in fmu.variables.items() if v.causality == "input"}
     if reference.start or any(fmu.variables[name].type != "Real" for name in inputs):
-        raise UnpassedError("does not apply", "pathsim runs FMUs with real inputs alone, and from 0 s")
+        raise SimulationError("not run with pathsim: it runs FMUs with real inputs alone, and from 0 s")
     block = CoSimulationFMU(str(fmu.path), start_values=_starts(fmu, reference), dt=reference.step)
     sources = {name: Constant(reference.inputs(0).get(name, value)) for name, value in inputs.items()}
     wires = [Connection(source, block[name]) for name, source in sources.items()]

@@ -19,7 +19,7 @@ from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
 from ..errors import FmuError, SimulationError
-from ..export.typed_values import IN_FMI_3
+from ..export.typed_values import IN_FMI_2, IN_FMI_3
 from .description import Fmu
 from .loading import NAMES, STATUSES, Prepared, loading, unique
 
@@ -86,9 +86,8 @@ class Instance:
         )
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
-        self._setters = {"Real": slave.setReal, "Integer": slave.setInteger, "Boolean": slave.setBoolean}
-        self._setters |= {"Enumeration": slave.setInteger, "String": slave.setString}
-        self._getters = {"Integer": slave.getInteger, "Boolean": slave.getBoolean}
+        self._setters = {kind: getattr(slave, f"set{named}") for kind, named in IN_FMI_2.items()}
+        self._getters = {kind: getattr(slave, f"get{named}") for kind, named in IN_FMI_2.items()}
         self._do_step, self._get = slave.dll["fmi2DoStep"], slave.dll["fmi2GetReal"]
         self._put = slave.dll["fmi2SetReal"]
         self.final: c_int | c_bool = c_int(1)
@@ -230,15 +229,16 @@ class Instance:
         """Return the calls of one step that C can make, the last of which read Real variables into rows."""
         return [("", self, self.prepared_step()), ("", self, self.prepared(names, address, len(names)))]
 
-    def value(self, name: str) -> float | bool:
-        """Return the value of an Integer or Boolean variable."""
+    def value(self, name: str, *, raw: bool = False) -> Any:
+        """Return the value of a variable; with ``raw``, the number in C of a Boolean of FMI 2.0."""
         variable = self.fmu.variables[name]
         size = len(self._starts[variable.type, variable.reference])
         try:
             read = self._getters[variable.type]([variable.reference], *self._of_size(size))[variable.element]
         except FMICallException as error:
             raise self.failure(error.status) from error
-        return bool(read) if variable.type == "Boolean" else int(read)
+        read = read.decode("utf-8", "replace") if isinstance(read, bytes) else read
+        return bool(read) if variable.type == "Boolean" and not raw else read
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
         """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
@@ -336,7 +336,7 @@ class Instance3(Instance):
         slave.instantiate(logMessage=lambda _environment, *message: self.log(*message), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
         self._setters = {kind: getattr(slave, f"set{named}") for kind, named in IN_FMI_3.items()}
-        self._getters = {"Integer": slave.getInt32, "Boolean": slave.getBoolean}
+        self._getters = {kind: getattr(slave, f"get{named}") for kind, named in IN_FMI_3.items()}
         self._do_step, self._get, self._put = (slave.dll[f"fmi3{n}"] for n in ("DoStep", "GetFloat64", "SetFloat64"))
         self.final = c_bool(True)
         self._rest = (self.final, *results)

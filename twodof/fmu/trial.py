@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import inf, isfinite
+from typing import Any
 
 from fmpy.model_description import ModelVariable
 
 from ..errors import SimulationError
+from ..export.typed_values import DISCRETE
 from .description import Fmu
 from .instance import Instance
 from .reference_runs import TIME_TOLERANCE
@@ -17,7 +19,7 @@ from .system_instance import instantiate_fmu
 
 STEPS = 20
 DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
-Outputs = tuple[float, ...]
+Outputs = tuple[Any, ...]
 
 
 class UnpassedError(Exception):
@@ -39,11 +41,13 @@ class Trial:
         steps: number of steps of a run, which ends at the stop time of the default experiment at the latest.
         variables: FMPy's descriptions of real variables, by the names of their elements.
         outputs, inputs: names of real outputs and continuous inputs.
+        held: names of discrete real inputs without clocks.
         starts: start values of real inputs and parameters that have one.
-        discrete_starts: those of integers and Booleans.
+        discrete_starts: those of types in DISCRETE, without clocks.
         exact: start values of other variables that are constant or have initial="exact".
         changing: names of inputs and parameters that may change between steps.
-        others: names of integer and Boolean outputs.
+        others: names of outputs of types in DISCRETE.
+        names: names of all these outputs, in the order of rows.
         clocks: names of the independent variable, at most one.
     """
 
@@ -60,24 +64,25 @@ class Trial:
             scalar.name: v for v in self.about.modelVariables for scalar in scalars(v, {}) if scalar.type == "Real"
         }
         self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
-        self.others = [
-            n for n, v in fmu.variables.items() if v.causality == "output" and v.type in ("Integer", "Boolean")
-        ]
+        self.others = [n for n, v in fmu.variables.items() if v.causality == "output" and v.type in DISCRETE]
+        self.names = [*self.outputs, *self.others]
         self.clocks = [name for name, v in self.variables.items() if v.causality == "independent"]
         inputs = [name for name, v in self.variables.items() if v.causality == "input"]
         self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
+        clocked = {v.valueReference for v in self.about.modelVariables if v.clocks}  # of FMI 3.0
+        self.held = [n for n in inputs if n not in self.inputs and fmu.variables[n].reference not in clocked]
 
-        given = [v for v in fmu.variables.values() if v.causality in ("input", "parameter")]
-        starts = {v: value for v in given if (value := v.start_value) is not None}
-        self.starts = {v.name: value for v, value in starts.items() if v.type == "Real"}
-        self.discrete_starts = {v.name: value for v, value in starts.items() if v.type != "Real"}
-        others = [v for v in fmu.variables.values() if v.exact and v.name not in {*self.starts, *self.discrete_starts}]
-        self.exact = {v.name: value for v in others if (value := v.start_value) is not None}
+        stated = [v for v in fmu.variables.values() if v.start is not None and v.type in {"Real", *DISCRETE}]
+        starts = [v for v in stated if v.causality in ("input", "parameter")]
+        self.starts = {v.name: float(v.initial_value) for v in starts if v.type == "Real"}
+        discrete = (v for v in starts if v.type != "Real" and v.reference not in clocked)
+        self.discrete_starts = {v.name: v.initial_value for v in discrete}
+        self.exact = {v.name: v.initial_value for v in stated if v.exact and v not in starts}
         self.changing = {v.name for v in starts if v.causality == "input" or v.variability == "tunable"}
 
     def changed_inputs(self) -> dict[str, float]:
         """Return values of the inputs that differ from their start values, so that an FMU at rest moves."""
-        return {name: self.inside(name, DELTA) for name in self.inputs}
+        return {name: self.inside(name, DELTA) for name in [*self.inputs, *self.held]}
 
     def changed_parameters(self) -> dict[str, float]:
         """Return values of parameters that differ from their start values; a parameter of 0 is often a switch."""
@@ -89,11 +94,17 @@ class Trial:
         }
 
     def changed_discrete(self) -> dict[str, float | bool]:
-        """Return values of integers and Booleans that differ from their start values."""
-        return {
-            name: not start if isinstance(start, bool) else start - 1 if start > 1 else start + 1
-            for name, start in self.discrete_starts.items()
-        }
+        """Return values of integers, enumerations and Booleans that differ from their start values."""
+        values: dict[str, float | bool] = {}
+        for name, start in self.discrete_starts.items():
+            items = [item for item in self.fmu.variables[name].items.values() if item != start]
+            if isinstance(start, bool):
+                values[name] = not start
+            elif items:
+                values[name] = items[0]
+            elif not isinstance(start, str) and self.fmu.variables[name].type != "Enumeration":
+                values[name] = start - 1 if start > 1 else start + 1
+        return values
 
     def require(self, *claims: str) -> None:
         """End a trial of a feature that the description does not claim."""
@@ -116,18 +127,26 @@ class Trial:
         instance.initialise(self.start, inf, values or {})
 
     def rows(self, instance: Instance, count: int = 0, first: int = 0) -> list[Outputs]:
-        """Return the outputs after each of ``count`` steps (0: all steps of a run) from step ``first`` on."""
-        rows: list[Outputs] = []
-        read = self.reader(instance)
-        for k in range(first, first + (count or self.steps)):
+        """Return the outputs after each of ``count`` steps (0: all steps of a run) from step ``first`` on.
+
+        The first row of a run has the outputs at its start.
+        """
+        read, last = self.reader(instance), first + (count or self.steps)
+        rows = [] if first else [self.checked(read(), 0)]
+        for k in range(first, last):
             self.note(f"step {k + 1}")
             instance.step(self.start + k * self.step, self.step)
-            rows.append(read())
+            rows.append(self.checked(read(), k + 1))
             self._compare_time(instance, k + 1)
-            for name, value in zip(self.outputs, rows[-1]):
-                if not isfinite(value):
-                    raise SimulationError(f"{name} is {value} after {k + 1} steps")
         return rows
+
+    def checked(self, row: Outputs, steps: int) -> Outputs:
+        """Return outputs after some steps; raise for a number that is not finite, and a Boolean not 0 or 1."""
+        for name, value in zip(self.names, row):
+            kind = self.fmu.variables[name].type
+            if (kind == "Real" and not isfinite(value)) or (kind == "Boolean" and value not in (0, 1)):
+                raise SimulationError(f"{name} is {value} after {steps} steps")
+        return row
 
     def _compare_time(self, instance: Instance, steps: int) -> None:
         """Raise for an independent variable that is not the time after some steps, within TIME_TOLERANCE of a step."""
@@ -139,19 +158,19 @@ class Trial:
     def reader(self, instance: Instance) -> Callable[[], Outputs]:
         """Return a function that reads all outputs, real ones first."""
         read = instance.reader(self.outputs)
-        return lambda: (*read(), *(instance.value(name) for name in self.others))
+        return lambda: (*read(), *(instance.value(name, raw=True) for name in self.others))
 
     def require_outputs(self) -> None:
         """End a trial that would compare nothing."""
         if not self.outputs and not self.others:
-            raise UnpassedError("does not apply", "it has no outputs of numbers or Booleans to compare")
+            raise UnpassedError("does not apply", "it has no outputs to compare")
 
     def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
         """Raise for rows that are not equal, with the name of the first output that differs."""
         for k, pair in enumerate(zip(expected, rows)):
-            for name, x, y in zip([*self.outputs, *self.others], *pair):
+            for name, x, y in zip(self.names, *pair):
                 if x != y:
-                    raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, {k + 1} steps on")
+                    raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, in row {k + 1} of the outputs")
 
     def inside(self, name: str, change: float) -> float:
         """Return a variable's start value plus a change, with this distance from its bounds if the range allows it."""
