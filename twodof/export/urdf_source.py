@@ -71,17 +71,12 @@ def without_meshes(text: str) -> str:
     return ET.tostring(tree, encoding="unicode")
 
 
-def lock_joints(text: str, locks: Mapping[str, float]) -> str:
-    """Return a URDF in which joints, by name or shell pattern, are fixed at positions, rad or m.
-
-    Joints that mimic a fixed joint are fixed too.
+def locked_positions(urdf: Urdf, locks: Mapping[str, float]) -> dict[str, float]:
+    """Return the positions, rad or m, at which joints are locked, by name or shell pattern, and those that mimic them.
 
     Raises:
         RobotError: no joint has such a name, or a position is outside its joint's limits.
     """
-    from scipy.spatial.transform import Rotation  # SciPy takes half a second to import
-
-    urdf = read_urdf(text)
     moving = {name: joint for name, joint in urdf.joints.items() if joint.moves}
     positions: dict[str, float] = {}
     for pattern, value in locks.items():
@@ -89,18 +84,26 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
         if not matches:
             raise RobotError(f"no joint '{pattern}' to lock{choice(pattern, moving)}")
         positions |= dict.fromkeys(matches, value)
-    elements = {str(e.get("name")): e for e in urdf.tree.findall("joint")}
     for name, joint in moving.items():
         if joint.leader in positions:
             positions.setdefault(name, joint.ratio * positions[joint.leader] + joint.offset)
         elif name in positions:
             raise RobotError(f"joint '{name}' mimics '{joint.leader}', which moves: lock '{joint.leader}'")
     for name, value in positions.items():
-        joint, element = moving[name], elements[name]
-        if not joint.low <= value <= joint.high:
-            raise RobotError(
-                f"joint '{name}' cannot be locked at {value:g}: its limits are {joint.low:g} and {joint.high:g}"
-            )
+        low, high = moving[name].low, moving[name].high
+        if not low <= value <= high:
+            raise RobotError(f"joint '{name}' cannot be locked at {value:g}: its limits are {low:g} and {high:g}")
+    return positions
+
+
+def lock_joints(text: str, locks: Mapping[str, float]) -> str:
+    """Return a URDF in which joints are fixed at the positions of ``locked_positions``, which raises its errors."""
+    from scipy.spatial.transform import Rotation  # SciPy takes half a second to import
+
+    urdf = read_urdf(text)
+    elements = {str(e.get("name")): e for e in urdf.tree.findall("joint")}
+    for name, value in locked_positions(urdf, locks).items():
+        joint, element = urdf.joints[name], elements[name]
         rotated = Rotation.from_euler("xyz", joint.rpy)
         xyz = np.array(joint.xyz)
         if joint.prismatic:

@@ -30,8 +30,9 @@ from ..signatures import with_keywords_of
 from .curves import efforts
 from .estimate import DELAY_SCALE, FIRST_NOISE, PRIOR, typical
 from .fit_result import check_folder
-from .fitting import GRAVITY, ModelOptions, read_model
+from .fitting import ModelOptions, read_model
 from .parameters import Parameters
+from .recording_checks import GRAVITY
 from .regression import Rows, information_root, position_derivatives, regressors
 from .stretches import Array, Stretch
 
@@ -132,15 +133,15 @@ class _Design:
         self._noise = FIRST_NOISE * np.sqrt(np.mean(stretch.tau**2, axis=0))
 
     def motion(self, coefficients: Array, step: float) -> Stretch:
-        """Return the motion, scaled to the largest one within the limits, in samples of a step, s."""
+        """Return the motion, scaled to the largest one whose samples are within the limits, in samples of a step, s."""
         shape = coefficients.reshape(self.shape).copy()
-        _, q, v, _ = self._moved(shape, COARSE / 4.0)
+        _, q, v, _ = self._moved(shape, min(step, COARSE / 4.0))
         off = np.abs(q - self._middle).max(axis=0) / self._reach
         shape /= np.maximum(off, np.abs(v).max(axis=0) / self._speed)[:, None, None]
         low, high = 0.0, 2.0
         for _ in range(HALVINGS):
             part = 0.5 * (low + high)
-            if (np.abs(self._sampled(part * shape, COARSE).tau) <= self._effort).all():
+            if (np.abs(self._sampled(part * shape, step).tau) <= self._effort).all():
                 low = part
             else:
                 high = part

@@ -65,6 +65,7 @@ class Fit:
         misfits: test of the model at each joint.
         suspects: errors of the setup that the residuals show, for which the intervals are wider.
         holds: rests of joints under a load that is larger than their friction.
+        locks: remarks on locked joints that are elsewhere in the bags.
         fragile: largest change of each parameter, in standard deviations, by constant errors of efforts that the data
             cannot show.
         noise: standard deviation of the efforts' residuals at each joint, N·m or N.
@@ -89,6 +90,7 @@ class Fit:
     misfits: tuple[Misfit, ...]
     suspects: tuple[Suspect, ...]
     holds: tuple[Hold, ...]
+    locks: tuple[str, ...]
     fragile: Mapping[str, float]
     noise: tuple[float, ...]
     delay: tuple[float, float]
@@ -157,6 +159,7 @@ class Fit:
             )
         if not lines:
             lines.append("the model explains these data: its residuals are noise")
+        lines += self.locks
         groups = {parameter.name.partition(":")[0] for parameter in self.parameters}
         if "gain" in groups and "mass" not in groups:
             lines.append(
@@ -208,6 +211,7 @@ class Fit:
                 "percent": 100.0 * (math.expm1(min(size, 99.0)) if "gain" in group else size),
                 "filtered": "efforts" if size > 0.0 else "positions",
                 "ms": 1e3 * math.sqrt(2.0 * abs(size)),
+                "shift": 1e3 * size,
             }
             found.append(ERRORS[group].format(name=name, joint=joint, size=size, **words))
         return (
@@ -288,8 +292,7 @@ class Fit:
         tables["Joints: residuals, and simulated positions (rms)"] = self._joint_rows
         settings = [f"{name} = {', '.join(map(repr, values))}" for name, values in self.settings.items()]
         facts = {"bags": "\n".join(self.bags), "settings of a build": "\n".join(settings or ["none"])}
-        facts["curves"] = "long ones are drawn through the extremes of their samples"
-        facts["made by"] = f"twodof {__version__}"
+        facts |= {"curves": "long ones are drawn through the extremes of samples", "made by": f"twodof {__version__}"}
         return fit_page(f"Fit of {self.urdf}", lines, tables, facts, dict(zip(self.joints, self.units)), self.curves)
 
     @property

@@ -15,7 +15,7 @@ from ..bag.records import ReadBudget
 from ..bounds import MAX_SAMPLES, MIB
 from ..errors import InputError
 from ..export.fmu_options import FmuOptions
-from ..export.urdf_source import end_effector, last_links, lock_joints, read_text
+from ..export.urdf_source import end_effector, last_links, lock_joints, locked_positions, read_text
 from ..files import shown
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, Urdf, read_urdf
@@ -26,20 +26,13 @@ from .estimate import NORMAL_95, PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
 from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
-from .regression import regressors
-from .stretches import Array, Stretch, jumps, stretches
+from .recording_checks import GRAVITY, check_external, check_units, moved_locks, recorded_gravity
+from .stretches import Array, jumps, stretches
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-SURE, SEPARATE = 10.0, 1e-6
-"""Standard deviations above 0, and relative singular value, from which on data determine a load."""
-LEAST_LOAD = 1e-3
-"""Load of a joint by gravity in one direction, as part of that in others, below which it is an error of rounding."""
-WRONG_UNITS = 300.0  # ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected
-WRONG_RANGE = 3.0  # ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected
 POSITIVE = ("friction", "damping", "armature", "payload", "mass")
-GRAVITY = (0.0, 0.0, -9.81)
 
 
 class ModelOptions(TypedDict, total=False):
@@ -130,12 +123,13 @@ def fit(
         check_folder(output)
     model, gravity = read_model(urdf, free, **options), options.get("gravity")
     recordings = _recordings(bags)
-    gravity = _recorded_gravity(recordings) if gravity is None else tuple(map(float, gravity))
+    recorded = recorded_gravity(recordings)
+    gravity = recorded if gravity is None else tuple(map(float, gravity))
     controller = _controller(model, gravity, options, settings or {})
     given, recordings = recordings, [with_efforts(each, controller) for each in recordings]
     parameters = model.parameters(gravity)
     fitted, held = stretches(recordings, model.robot)
-    _check_all_units(parameters, fitted, recordings)
+    check_units(parameters, fitted, recordings)
     finished = _counter(progress, PASSES + 2 * len(held))
     found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
@@ -145,7 +139,7 @@ def fit(
         found = found._replace(interrupted=True)
         compared = compare(model.robot, models, fitted, [], finished)
     given = [raw if raw.tau.size else each for raw, each in zip(given, recordings)]
-    result = _result(model, parameters, found, compared, given)
+    result = _result(model, parameters, found, compared, given, options.get("lock") or {})
     if output is not None:
         result.save(output)
     return result
@@ -178,6 +172,7 @@ def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
     budget, recordings, size = ReadBudget(), list[Recording](), 0
     for bag in [bags] if isinstance(bags, str | Path) else bags:
         recordings += read_bags([bag], budget)
+        check_external(recordings[-1])
         size += sum(values.nbytes for values in (recordings[-1].q, recordings[-1].v, recordings[-1].tau))
         if size > MAX_SAMPLES:
             raise InputError(f"the bags to '{bag}' have over {MAX_SAMPLES // MIB} MiB of joint states; give fewer")
@@ -189,85 +184,13 @@ def _recordings(bags: str | Path | Sequence[str | Path]) -> list[Recording]:
     return recordings
 
 
-def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
-    """Return the gravity of the run that made the first bag, m/s²."""
-    starts = recordings[0].provenance.get("start_values") or {}
-    return tuple(float(starts.get(f"gravity[{k + 1}]", GRAVITY[k])) for k in range(3))
-
-
-def _check_all_units(parameters: Parameters, fitted: Sequence[Stretch], recordings: Sequence[Recording]) -> None:
-    """Check the units of each bag that is fitted."""
-    for bag, recording in enumerate(recordings):
-        if own := [stretch for stretch in fitted if stretch.bag == bag]:
-            _check_units(parameters, own, shown(recording.path))
-
-
-def _check_units(parameters: Parameters, fitted: Sequence[Stretch], bag: str) -> None:
-    """Refuse positions of a bag far beyond the URDF's range, and efforts that differ much from those of its masses."""
-    robot = parameters.robot
-    for i, joint in enumerate(robot.joints):
-        least = min(float(each.measured[:, i].min()) for each in fitted)
-        most = max(float(each.measured[:, i].max()) for each in fitted)
-        low, high = robot.q_min[i], robot.q_max[i]
-        if not robot.prismatic[i] and most - least > WRONG_RANGE * (high - low) > 0.0:
-            raise InputError(
-                f"'{bag}': the positions of joint '{joint}' are between {least:.3g} and {most:.3g}, and its limits"
-                f" {low:.3g} and {high:.3g} rad: they are probably in degrees; convert them, or correct the limits"
-            )
-    values = parameters.dynamics(parameters.start)
-    stretch = max(fitted, key=lambda each: len(each.t))
-    few = stretch.part(slice(None, None, max(1, len(stretch.t) // 200)))
-    Y, G = regressors(robot, few, values, np.empty(0, np.int64))
-    model = Y[:, :, 0] + np.einsum("g,kgi->ki", values.gravity, G[:, :, :, 0])
-    for joint, effort in zip(robot.joints, few.tau.T):
-        if not effort.any():
-            raise InputError(f"'{bag}': the effort of joint '{joint}' is 0 throughout: it was not recorded")
-    turning = ~np.array(robot.prismatic)
-    own = zip(few.tau.T, G[:, :, :, 0].transpose(2, 0, 1), Y[:, :, 0].T, few.v.T, few.a.T)
-    scales = np.array([_gravity_of(values.gravity, *each) for each in own])[turning]
-    scales /= np.linalg.norm(values.gravity) or np.nan
-    theirs, ours = (np.sqrt(np.mean(each**2, axis=0))[turning] for each in (few.tau, model))
-    usual = np.exp(np.median(np.log(scales[known]))) if (known := np.isfinite(scales)).any() else 1.0
-    if not 1.0 / WRONG_UNITS < usual < WRONG_UNITS:
-        raise InputError(
-            f"'{bag}': the recorded efforts are {usual:.2g} times those of the URDF's masses: they are probably not in"
-            " N·m, but for example in N·mm, a factor of 1000; convert them, or correct the masses"
-        )
-    high = np.flatnonzero(scales > WRONG_UNITS).tolist()  # a payload can do so to a light wrist, but not to it alone
-    if len(high) == 1 and theirs[high[0]] == max(theirs.max(), ours.max()):
-        joint = np.array(robot.joints)[turning][high[0]]
-        raise InputError(
-            f"'{bag}': the recorded efforts of joint '{joint}' are {scales[high[0]]:.2g} times those of the URDF's"
-            " masses, unlike those of other joints: they are probably in N·mm, a factor of 1000; convert them, or"
-            " correct the masses"
-        )
-
-
-def _gravity_of(given: Array, tau: Array, loads: Array, inertia: Array, v: Array, a: Array) -> float:
-    """Return the gravity that explains a joint's efforts beside inertia, friction, damping and armature, m/s².
-
-    NaN if the data do not determine it, as for a joint without load. ``loads`` are efforts of gravity of 1 m/s² along
-    each axis, N × 3.
-    """
-    strength = np.abs(loads).max(axis=0)
-    loads = np.where(strength > LEAST_LOAD * strength.max(), loads, 0.0)
-    columns = np.column_stack([loads, inertia, np.sign(v), v, a])
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    U, strengths, directions = np.linalg.svd(columns / size, full_matrices=False)
-    inverse = directions.T / np.where(strengths > SEPARATE * strengths[0], strengths, np.inf)
-    noise = float(np.sum((tau - U @ (U.T @ tau)) ** 2)) / max(1, len(tau) - len(size))
-    found, deviation = (inverse @ U.T @ tau / size)[:3], np.sqrt(noise * np.sum(inverse**2, axis=1))[:3] / size[:3]
-    gravity = float(np.linalg.norm(found))
-    loaded = np.abs(loads).max() > SEPARATE * np.abs(tau).max()
-    # a joint that the given gravity does not load cannot show that efforts are too small
-    free = np.abs(loads @ given).max() <= LEAST_LOAD * strength.max() * np.linalg.norm(given)
-    sure = loaded and gravity > SURE * np.linalg.norm(deviation) and not (free and gravity < np.linalg.norm(given))
-    return gravity if sure else np.nan
-
-
 def _result(
-    model: Model, parameters: Parameters, found: Estimate, compared: Comparison, recordings: Sequence[Recording]
+    model: Model,
+    parameters: Parameters,
+    found: Estimate,
+    compared: Comparison,
+    recordings: Sequence[Recording],
+    locks: Mapping[str, float],
 ) -> Fit:
     robot = model.robot
     return Fit(
@@ -281,6 +204,7 @@ def _result(
         misfits=found.misfits,
         suspects=found.suspects,
         holds=found.holds,
+        locks=moved_locks(recordings, locked_positions(model.urdf, locks)),
         fragile=dict(zip(parameters.names, found.fragile.tolist())),
         noise=tuple(found.noise.tolist()),
         delay=found.delay,

@@ -39,6 +39,8 @@ ERRORS = {
     "spring": "a spring of about {size:.2g} {effort}/{unit} at joint '{joint}' (it is not part of the model)",
     "payload": "a payload of about {size:+.2g} kg (free '{name}', or correct the masses)",
     "filter": "{filtered} behind a filter with a time constant of about {ms:.2g} ms (record them without it)",
+    "delay": "stamps of the efforts of joint '{joint}' that need about {shift:+.2g} ms, beside those of other joints"
+    " (correct the stamps)",
     "clock": "speeds that need about {percent:+.2g} %, as of a wrong clock",
 }
 """Texts of errors of the setup, by the first part of their names."""
@@ -152,14 +154,17 @@ def _others(joints: Sequence[str], rows: Sequence[Rows], sd: Sequence[Array], dy
     """Return the derivatives of all whitened residuals with respect to each error that is not a parameter."""
     clock = np.concatenate([stretched(each, dynamics) / s for each, s in zip(rows, sd)])
     parts = [-each.unmodelled / s[:, None] for each, s in zip(rows, sd)]
+    rates = [-each.tau_rate / s for each, s in zip(rows, sd)]
     slow = [part[:, -1] * (each.bin < SLOW) for each, part in zip(rows, parts)]
     carried = np.concatenate([part[:, -2] for part in parts])
     others, begin = {"clock": clock, "filter": np.concatenate(slow), "payload": carried}, 0
-    for each, part in zip(rows, parts):
+    for each, part, late in zip(rows, parts, rates):
         own = slice(begin, begin := begin + len(part))
         for name, column in zip(UNMODELLED[:-2], part.T):
             others[f"{name}:{joints[each.joint]}"] = np.zeros(len(clock))
             others[f"{name}:{joints[each.joint]}"][own] = column
+        others[f"delay:{joints[each.joint]}"] = np.zeros(len(clock))
+        others[f"delay:{joints[each.joint]}"][own] = late
     return others
 
 
