@@ -19,18 +19,20 @@ from fmpy import fmi2
 from fmpy.ssp.simulation import simulate_ssp
 from harness import in_child_process
 from scipy.integrate import solve_ivp
-from systems import component, connection, loop, ssd
+from systems import component, connection, loop, pd_fmu, ssd
 from tools import needs
 
 import twodof
 from twodof.errors import BuildError
 from twodof.export.split import SSD
 from twodof.fmu import System
+from twodof.fmu.ssp_file import STRUCTURE
 from twodof.fmu.system_instance import instantiate_fmu
 
 TARGETS: dict[str, dict[str, Any]] = {"task": {"x_des": (0.25, 0.1)}, "joint": {"q_des": (0.1, 0.9)}}
 EXACT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 STOP = 1.0
+FREE = 'suppressUnitConversion="true"'
 
 
 @pytest.fixture(scope="module")
@@ -236,6 +238,27 @@ def test_a_payload_that_only_the_controller_has_is_named(ssp: Path) -> None:
     assert head.endswith("; set controller.payload=0")
     cured = twodof.simulate(ssp, settings={**settings, "controller.payload": 0.0}).verdict
     assert cured.outcome == "reached" and not cured.causes
+
+
+@pytest.mark.parametrize(
+    "driven", [("tau_ext[1]", "tau_ext[2]"), ("tau_ext[2]",), ("f_ext[1]",), ("f_ext[2]", "f_ext[1]")]
+)
+def test_a_verdict_does_without_efforts_of_another_fmu(ssp: Path, tmp_path: Path, driven: tuple[str, ...]) -> None:
+    """A push of 0.3 N·m or N moves the arm away; its values are not known to the verdict."""
+    path, push = tmp_path / "pushed.ssp", component("push")
+    ends = "".join(connection(f"push.tau[{i + 1}]", f"plant.{end}", more=FREE) for i, end in enumerate(driven))
+    with zipfile.ZipFile(ssp) as arm, zipfile.ZipFile(path, "w") as pushed:
+        for name in arm.namelist():
+            text = arm.read(name)
+            if name == STRUCTURE:
+                for more, end in ((push, b"</ssd:Elements>"), (ends, b"</ssd:Connections>")):
+                    assert text.count(end) == 1
+                    text = text.replace(end, more.encode() + end)
+            pushed.writestr(name, text)
+        pushed.writestr("resources/push.fmu", pd_fmu(effort="0.3", replaced={"q_des": "level"}))
+    verdict = twodof.simulate(path, stop_time=8.0, settings={"x_des": (0.25, 0.1)}).verdict
+    assert verdict.outcome == "not reached" and verdict.numbers["final_error"] > 1e-3
+    assert not any(cause.kind == "load" and "_ext" in cause.subject for cause in verdict.causes)
 
 
 @pytest.mark.parametrize(
