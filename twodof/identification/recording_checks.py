@@ -23,7 +23,7 @@ LEAST_LOAD = 1e-3
 """Load of a joint by gravity in one direction, as part of that in others, below which it is an error of rounding."""
 WRONG_UNITS = 300.0  # ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected
 WRONG_RANGE = 3.0  # ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected
-EXCHANGED = 0.1  # part of the residual power of a joint's efforts, below which those of another joint explain them
+EXCHANGED = 0.3  # part of the residual power of a joint's efforts, below which those of another joint explain them
 LOCKED = 0.02  # rad or m: distance of a locked joint from its position, above which a remark names it
 
 
