@@ -382,6 +382,65 @@ def test_a_connector_is_the_target_only_in_si_units_if_it_drives_the_robot(
     assert (twodof.run(path, step=H, stop_time=N * H).verdict.outcome != "no target") == (name == "q_des")
 
 
+def _wires(rows: str) -> str:
+    """Return the XML of connections, of lines "start end" or "start end factor"."""
+    texts = []
+    for start, end, *factor in map(str.split, rows.split(",")):
+        inside = f'<ssc:LinearTransformation factor="{factor[0]}"/>' if factor else ""
+        texts.append(connection(start, end, inside))
+    return "".join(texts)
+
+
+STRAIGHT = "plant.q[1] pd.q[1], plant.q[2] pd.q[2]"
+GEARED = "plant.q[1] pd.q[1] 10, plant.q[2] pd.q[2] 10"
+
+
+@pytest.mark.parametrize(
+    ("measured", "given", "name"),
+    [
+        (STRAIGHT, "", "q_des"),
+        (STRAIGHT.replace("pd.q", "pd.angle"), "", "q_des"),
+        ("plant.q[1] pd.q[2], plant.q[2] pd.q[1]", "", "pd.q_des"),
+        (GEARED, "", "pd.q_des"),
+        ("plant.q[1] pd.q[1]", "", "pd.q_des"),
+        ("plant.q[1] pd.q[1], plant.q[2] pd.q[2] 10", "", "pd.q_des"),
+        (STRAIGHT, "q_des[1] pd.q_des[1], q_des[2] pd.q_des[2]", "q_des"),
+        (GEARED, "q_des[1] pd.q_des[1] 10, q_des[2] pd.q_des[2] 10", "q_des"),
+        (GEARED, "q_des[1] pd.q_des[1], q_des[2] pd.q_des[2]", "system.q_des"),
+        (STRAIGHT, "q_des[1] pd.q_des[2], q_des[2] pd.q_des[1]", "system.q_des"),
+        (STRAIGHT, "q_des[1] pd.q_des[1], q_des[2] pd.q_des[2] 2", "system.q_des"),
+        (STRAIGHT, "q_des[1] pd.q_des[1]", "system.q_des[1]"),
+    ],
+)
+def test_a_target_is_in_the_coordinates_in_which_its_controller_reads_the_robot(
+    measured: str, given: str, name: str, plant: bytes, pd: bytes, tmp_path: Path
+) -> None:
+    """A gear, a reversed order of the joints, or an element that is not connected leaves no target."""
+    names = {f'name="q[{i}]"': f'name="angle[{i}]"' for i in (1, 2)} if "angle" in measured else {}
+    effort = "pd.tau[1] plant.tau_cmd[1], pd.tau[2] plant.tau_cmd[2]"
+    wires = "".join(_wires(rows) for rows in (measured, effort, given) if rows)
+    ports = connectors({f"q_des[{i}]": "input" for i in (1, 2)}) if given else ""
+    structure = ssd(f"{ports}{BOTH}<ssd:Connections>{wires}</ssd:Connections>")
+    path = loop(tmp_path / "loop.ssp", plant, pd_fmu(replaced=names) if names else pd, structure)
+    system = twodof.load_fmu(path)
+    assert system.vector(name) and bool(system.vector("q_des")) == (name == "q_des")
+    outcome = twodof.run(path, step=H, stop_time=N * H, settings={name: 0.3}).verdict.outcome
+    assert (outcome != "no target") == (name == "q_des")
+
+
+def test_only_the_controllers_of_the_chosen_robot_have_its_target(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """A second robot with its own controller, and a spare controller."""
+    left = [text.replace('"p', '"left_p') for text in (component("plant"), component("pd"), WIRES)]
+    parts = "".join(left[:2]).replace("resources/left_", "resources/")
+    spare = component("pd").replace('name="pd"', 'name="spare"')
+    elements = BOTH.replace("</ssd:Elements>", f"{parts}{spare}</ssd:Elements>")
+    path = loop(tmp_path / "two.ssp", plant, pd, ssd(f"{elements}<ssd:Connections>{WIRES}{left[2]}</ssd:Connections>"))
+    for robot, controller in (("plant", "pd"), ("left_plant", "left_pd")):
+        system = twodof.load_fmu(path, robot)
+        target = [f"q_des[{i}]" for i in (1, 2)]
+        assert system.vector("q_des") == system.vector(f"{controller}.q_des") == target
+
+
 def test_a_connector_does_not_hide_a_vector_of_the_robot(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     ports = connectors({"q[1]": "input"})
     wires = f"<ssd:Connections>{WIRES}{connection('q[1]', 'pd.q_des[1]')}</ssd:Connections>"

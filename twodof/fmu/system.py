@@ -16,6 +16,7 @@ from ..export.typed_values import Type
 from .description import RECORDED, SI, Fmu, load_any_fmu, logged
 from .scalar import Scalar
 from .ssp_file import IDENTITY, STRUCTURE, Affine, Parameter, read_ssp
+from .targets import targets_of
 from .wiring import Link, Node, Wiring, conversion, order
 
 MOST_NAMED = 5  # names in a remark
@@ -190,15 +191,6 @@ def _measuring(fmus: Mapping[str, Fmu], links: list[Link], robot: str) -> str:
     return having[0] if len(having) == 1 else robot
 
 
-def _driving(links: list[Link], robot: str) -> set[str]:
-    """Return the robot, and the components on whose outputs its inputs depend."""
-    driving = found = {robot}
-    while found:
-        found = {link.source.element for link in links if link.target.element in found} - driving
-        driving = driving | found
-    return driving
-
-
 def _bound(path: Path, wiring: Wiring) -> tuple[dict[Node, Start], list[str]]:
     """Return start values from parameter bindings, and names without effect; outer systems precede inner ones.
 
@@ -271,7 +263,7 @@ def _variables(
         variables[name] = replace(scalar, name=name, causality=causality, start=text)
         nodes[name] = node
 
-    driving = _driving(links, robot)
+    goals = targets_of(wiring, fmus, links, robot)
     driven: dict[Node, list[Link]] = {}
     for link in (link for link in links if link.source.element not in fmus):
         driven.setdefault(link.source, []).append(link)
@@ -286,8 +278,7 @@ def _variables(
         start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
         typed = None if start is None else _typed(path, source, first, start)
         assert not isinstance(typed, str)  # connections have numbers and Booleans
-        same = [link.target for link in targets if link.map == IDENTITY or wiring.unit(link.target).is_scaled]
-        plain = _is_plain(wiring, source, first, driving & {target.element for target in same})
+        plain = source in goals or source.connector.partition("[")[0] not in RECORDED
         scalar = replace(first, unit=wiring.unit(source).name or first.unit)
         add(str(source) if plain else f"system.{source}", source, scalar, causality, typed)
     ends = {link.target for link in links}
@@ -296,21 +287,14 @@ def _variables(
         for scalar in fmus[element].variables.values():
             node = Node(element, scalar.name)
             if scalar.causality in ("input", "output", "parameter"):
-                alone = scalar.causality == "input" and node not in ends and names[scalar.name] == 1
                 group = scalar.name.partition("[")[0]
+                free = scalar.causality == "input" and node not in ends and group not in RECORDED
                 of = measuring if group in ("q_meas", "v_meas") else robot
                 if group in RECORDED and element == robot and (unit := wiring.unit(node)).is_scaled:
                     raise FmuError(f"'{path}': {node} is in {unit.name}; {SI}")
-                alone &= _is_plain(wiring, node, scalar, driving & {element})
+                alone = node in goals or (free and names[scalar.name] == 1)
                 own = (element == of or alone) and scalar.name not in variables
                 start = starts.get(node, scalar.start_value)
                 causality = "local" if node in ends else scalar.causality
                 add(scalar.name if own else str(node), node, scalar, causality, start)
     return variables, nodes
-
-
-def _is_plain(wiring: Wiring, node: Node, scalar: Scalar, driving: set[str]) -> bool:
-    """Return whether an input keeps its name: it is not RECORDED, or is a target in SI units that drives the robot."""
-    group = node.connector.partition("[")[0]
-    target = group.endswith("_des") and bool(driving) and scalar.type == "Real"
-    return group not in RECORDED or (target and not wiring.unit(node).is_scaled)
