@@ -28,6 +28,7 @@ from twodof.export.split import SSD
 from twodof.fmu import System
 from twodof.fmu.ssp_file import STRUCTURE
 from twodof.fmu.system_instance import instantiate_fmu
+from twodof.plots.track import read_tracks
 
 TARGETS: dict[str, dict[str, Any]] = {"task": {"x_des": (0.25, 0.1)}, "joint": {"q_des": (0.1, 0.9)}}
 EXACT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
@@ -240,25 +241,36 @@ def test_a_payload_that_only_the_controller_has_is_named(ssp: Path) -> None:
     assert cured.outcome == "reached" and not cured.causes
 
 
-@pytest.mark.parametrize(
-    "driven", [("tau_ext[1]", "tau_ext[2]"), ("tau_ext[2]",), ("f_ext[1]",), ("f_ext[2]", "f_ext[1]")]
-)
-def test_a_verdict_does_without_efforts_of_another_fmu(ssp: Path, tmp_path: Path, driven: tuple[str, ...]) -> None:
-    """A push of 0.3 N·m or N moves the arm away; its values are not known to the verdict."""
-    path, push = tmp_path / "pushed.ssp", component("push")
-    ends = "".join(connection(f"push.tau[{i + 1}]", f"plant.{end}", more=FREE) for i, end in enumerate(driven))
-    with zipfile.ZipFile(ssp) as arm, zipfile.ZipFile(path, "w") as pushed:
+def pushed(ssp: Path, path: Path, value: float, *ends: str) -> Path:
+    """Add an FMU to a split robot, with constant outputs that are connected to inputs."""
+    wires = (connection(f"push.tau[{i}]", end, more=FREE) for i, end in enumerate(ends, 1))
+    with zipfile.ZipFile(ssp) as arm, zipfile.ZipFile(path, "w") as whole:
         for name in arm.namelist():
             text = arm.read(name)
             if name == STRUCTURE:
-                for more, end in ((push, b"</ssd:Elements>"), (ends, b"</ssd:Connections>")):
+                for more, end in ((component("push"), b"</ssd:Elements>"), ("".join(wires), b"</ssd:Connections>")):
                     assert text.count(end) == 1
                     text = text.replace(end, more.encode() + end)
-            pushed.writestr(name, text)
-        pushed.writestr("resources/push.fmu", pd_fmu(effort="0.3", replaced={"q_des": "level"}))
+            whole.writestr(name, text)
+        whole.writestr("resources/push.fmu", pd_fmu(effort=repr(value), replaced={"q_des": "level"}))
+    return path
+
+
+@pytest.mark.parametrize("ends", ["tau_ext[1] tau_ext[2]", "tau_ext[2]", "f_ext[1]", "f_ext[2] f_ext[1]"])
+def test_a_verdict_does_without_efforts_of_another_fmu(ssp: Path, tmp_path: Path, ends: str) -> None:
+    """A push of 0.3 N·m or N moves the arm away; its values are not known to the verdict."""
+    path = pushed(ssp, tmp_path / "pushed.ssp", 0.3, *(f"plant.{end}" for end in ends.split()))
     verdict = twodof.simulate(path, stop_time=8.0, settings={"x_des": (0.25, 0.1)}).verdict
     assert verdict.outcome == "not reached" and verdict.numbers["final_error"] > 1e-3
     assert not any(cause.kind == "load" and "_ext" in cause.subject for cause in verdict.causes)
+
+
+@pytest.mark.parametrize("driven", ["Kp[2]", "Kd[2]", "xd_des[2]"])
+def test_a_plot_has_no_closed_form_if_another_fmu_gives_a_gain(ssp: Path, tmp_path: Path, driven: str) -> None:
+    path = pushed(ssp, tmp_path / "pushed.ssp", 0.1, f"controller.{driven}")
+    twodof.run(path, twodof.Bag(tmp_path / "bag", scene=True), stop_time=0.2)
+    (track,) = read_tracks([tmp_path / "bag"])
+    assert track.task is None or track.task.closed_form is None
 
 
 @pytest.mark.parametrize(

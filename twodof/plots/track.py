@@ -264,7 +264,8 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         dof = {joint.leader for joint in linkage.chain}
         followed = len(axes) + 3 * turns <= len(dof)  # all task rows can be followed exactly
         few = len(bag.schedule) <= MOST_HELD
-        if not (inputs_known and followed and few and all(f"{g}[1]" in first for g in Held._fields)):
+        whole = all(f"{g}[{i + 1}]" in first for g in Held._fields for i in range(len(axes)))  # else of another FMU
+        if not (inputs_known and followed and few and whole):
             return Task(linkage.axes, target, error, None, None, ())
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
         xd0 = (linkage.kinematics.jacobian(linkage.frame, q[:1])[0] @ v0)[axes]
