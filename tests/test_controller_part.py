@@ -265,7 +265,7 @@ def test_a_verdict_does_without_efforts_of_another_fmu(ssp: Path, tmp_path: Path
     assert not any(cause.kind == "load" and "_ext" in cause.subject for cause in verdict.causes)
 
 
-@pytest.mark.parametrize("driven", ["Kp[2]", "Kd[2]", "xd_des[2]"])
+@pytest.mark.parametrize("driven", ["Kp[2]", "Kd[2]", "xd_des[2]", "x_des[2]"])
 def test_a_plot_has_no_closed_form_if_another_fmu_gives_a_gain(ssp: Path, tmp_path: Path, driven: str) -> None:
     path = pushed(ssp, tmp_path / "pushed.ssp", 0.1, f"controller.{driven}")
     twodof.run(path, twodof.Bag(tmp_path / "bag", scene=True), stop_time=0.2)

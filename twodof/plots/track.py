@@ -264,7 +264,8 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         dof = {joint.leader for joint in linkage.chain}
         followed = len(axes) + 3 * turns <= len(dof)  # all task rows can be followed exactly
         few = len(bag.schedule) <= MOST_HELD
-        whole = all(f"{g}[{i + 1}]" in first for g in Held._fields for i in range(len(axes)))  # else of another FMU
+        sizes = range(len(axes) if "system" in bag.provenance else 1)  # another FMU may give elements
+        whole = all(f"{g}[{i + 1}]" in first for g in Held._fields for i in sizes)
         if not (inputs_known and followed and few and whole):
             return Task(linkage.axes, target, error, None, None, ())
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
