@@ -214,6 +214,18 @@ def test_probable_mistakes_get_a_remark(
     assert [record.getMessage() for record in caplog.records] == [f"'{two}': {line}"]
 
 
+@pytest.mark.parametrize("names", ["payload plant.payload", "pd.q_des q_des", "q_des[2] pd.q_des[2]"])
+def test_a_variable_under_two_names_is_refused(names: str, plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """In settings, and in the answer to a sample."""
+    system, (first, second) = loop(tmp_path / "loop.ssp", plant, pd), names.split()
+    line = re.escape(f"is given twice, as '{first}' and as '{second}'; leave one out")
+    with pytest.raises(InputError, match=line):
+        twodof.experiment(system, settings={first: 0.1, second: 0.2})
+    with closing(twodof.samples(system, step=H, stop_time=N * H)) as run, pytest.raises(InputError, match=line):
+        next(run)
+        run.send({first: 0.1, second: 0.2})
+
+
 def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     """They have annotations, geometry, empty or unknown units, further kinds of connectors, or SSP 2.0's number."""
     note = '<ssd:Annotations><ssc:Annotation type="x"><o:Step xmlns:o="o" size="1"/></ssc:Annotation></ssd:Annotations>'

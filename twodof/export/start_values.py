@@ -85,7 +85,8 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
     """Return values by variable name; a group's name sets all of its elements.
 
     Raises:
-        InputError: a name is unknown or an output, or a value has a wrong number or type, or is not finite.
+        InputError: a name is unknown or an output, a variable is given under two names, or a value has a wrong number
+            or type, or is not finite.
     """
     values, texts = resolve_all(fmu, settings)
     if texts:
@@ -99,8 +100,11 @@ def resolve_all(fmu: Variables, settings: Mapping[str, Setting]) -> tuple[dict[s
         raise InputError(f"settings are values by name, as {{'Kp': 80}}, not {settings!r:.50}")
     values: dict[str, Value] = {}
     texts: dict[str, str] = {}
-    for name, setting in settings.items():
-        name = fmu.aliases.get(name, name)
+    names: dict[str, str] = {}
+    for asked, setting in settings.items():
+        name = fmu.aliases.get(asked, asked)
+        if (other := names.setdefault(name, asked)) != asked:
+            raise InputError(f"{name} is given twice, as '{other}' and as '{asked}'; leave one out")
         elements = [name] if name in fmu.variables else vector(fmu.variables, name)
         if not elements:
             raise InputError(no_variable(fmu, name, "input", "parameter"))
