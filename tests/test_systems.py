@@ -198,11 +198,13 @@ def test_probable_mistakes_get_a_remark(
     part = WIRES.replace(connection("plant.v[2]", "pd.v[2]"), "")
     system = loop(tmp_path / "part.ssp", plant, pd, ssd(f"{BOTH}<ssd:Connections>{part}</ssd:Connections>"))
     twodof.experiment(system)
-    line = "not all elements of an input are connected: pd.v[2] keep their values"
+    line = "not all elements of an input are connected: pd.v[2] keeps its value"
     assert [record.getMessage() for record in caplog.records] == [f"'{system}': {line}"]
     assert line in str(twodof.check(system).rows[0])
     assert main(["info", str(system)]) == 0 and line in capsys.readouterr().out
     caplog.clear()
+    twodof.experiment(system, settings={"pd.v[2]": 0.1})
+    assert not caplog.records
     elements = component("plant") + component("plant").replace('name="plant"', 'name="left"')
     two = loop(tmp_path / "two.ssp", plant, pd, ssd(f"<ssd:Elements>{elements}</ssd:Elements>"))
     fmu = twodof.load_fmu(two, "plant")
@@ -224,6 +226,30 @@ def test_a_variable_under_two_names_is_refused(names: str, plant: bytes, pd: byt
     with closing(twodof.samples(system, step=H, stop_time=N * H)) as run, pytest.raises(InputError, match=line):
         next(run)
         run.send({first: 0.1, second: 0.2})
+
+
+def test_an_unknown_name_gets_those_of_components_or_elements(plant: bytes, tmp_path: Path) -> None:
+    """There are two controllers, or a vector whose first element is connected."""
+    controller = pd_fmu(replaced={f'name="q_des[{i}]"': f'name="goal[{i}]"' for i in (1, 2)})
+    spare = component("pd").replace('name="pd"', 'name="spare"')
+    both, wires = BOTH.replace("</ssd:Elements>", f"{spare}</ssd:Elements>"), connection("plant.q[1]", "pd.goal[1]")
+    for elements, name, end in (
+        (both, "Kp", "there are: pd.Kp, spare.Kp"),
+        (both, "goal", "there are: pd.goal, spare.goal"),
+        (BOTH, "Kp", "did you mean 'pd.Kp'?"),
+        (BOTH, "goal", "did you mean 'goal[2]'?"),
+    ):
+        structure = ssd(f"{elements}<ssd:Connections>{wires}</ssd:Connections>")
+        path = loop(tmp_path / "loop.ssp", plant, controller, structure)
+        with pytest.raises(InputError, match=re.escape(f"there is no variable '{name}'; {end}")):
+            twodof.experiment(path, settings={name: 0.1})
+
+
+def test_a_damaged_system_is_no_zip_archive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "loop.ssp").write_bytes(b"PK")
+    for verb in ("info", "run"):
+        assert main([verb, str(tmp_path / "loop.ssp")]) == 1
+        assert "it is not a valid zip archive" in capsys.readouterr().err
 
 
 def test_systems_as_other_tools_write_them_are_read(plant: bytes, pd: bytes, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def call(options: argparse.Namespace) -> int:
         raise InputError(f"'{path}' is a {what}'s file; give the {what}'s folder, '{path.parent}'")
     elif path.suffix != ".fmu" and not path.exists():
         raise InputError(no_such("FMU", path, "bag", "sweep"))
-    elif path.suffix != ".fmu" and path.is_file() and not zipfile.is_zipfile(path):
+    elif path.suffix not in (".fmu", ".ssp") and path.is_file() and not zipfile.is_zipfile(path):
         other = f"'{path}' is neither an FMU nor the folder of a bag or a sweep"
         raise InputError(no_such("FMU", path) if kind_of(path) else other)
     else:

@@ -154,13 +154,18 @@ def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
     """Return the message for an unknown name, with its control law or the nearest names."""
     groups = {g: names for causality in causalities for g, names in groups_of(fmu.variables, causality).items()}
     indexed = re.sub(r"_?(?<!\d)(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
-    known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
+    known = [each for each in dict.fromkeys([*groups, *chain(*groups.values())]) if each != name]
     near = nearest(name, known, 0.85)
     if near is None and "." in name:  # Kp of a system, not controller.Kp
         near = nearest(name.rpartition(".")[2], [each for each in known if "." not in each], 0.6)
     unitless = re.sub(r"\s+[\[(].*$", "", name)  # Kp [1/s2] of a table
     part = re.fullmatch(r"(\w+_des|K[pd])[._]([xyz])", unitless)  # x_des.x of an exported table
     axis = f"{part[1]}[{str(getattr(fmu, 'axes', '')).find(part[2]) + 1}]" if part else ""
-    own = [each for each in (indexed, axis, near, MEANT.get(name), unitless) if each in known]
+    of_components = [each for each in known if each.endswith(f".{name}")]
+    elements = [each for each in known if each.startswith(f"{name}[")]  # of a vector whose first one is connected
+    meant = (*of_components, *elements, indexed, axis, near, MEANT.get(name), unitless)
+    own = [each for each in meant if each in known]
     like = f"; did you mean '{own[0]}'?" if own else choice(name, known, ALIKE)
+    if len(of_components) > 1:
+        like = choice("", of_components)
     return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"

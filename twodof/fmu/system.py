@@ -67,17 +67,20 @@ class System(Fmu):
             first = ", ".join(f"{name:.80}" for name in self.ignored[:MOST_NAMED])
             more = f" and {len(self.ignored) - MOST_NAMED} more" * (len(self.ignored) > MOST_NAMED)
             lines.append(f"parameter bindings name no variable that can be set, and are ignored: {first}{more}")
+        asked = [*asked]
+        given = {self.nodes.get(self.aliases.get(name, name)) for name in asked}
         for element, fmu in self.components.items():
             for names in fmu.groups("input").values():
-                left = [f"{element}.{name}" for name in names if Node(element, name) not in ends]
-                if 0 < len(left) < len(names):
-                    lines.append(f"not all elements of an input are connected: {', '.join(left)} keep their values")
+                left = [node for name in names if (node := Node(element, name)) not in ends]
+                if len(left) < len(names) and not given.issuperset(left):
+                    kept = _kept([f"{node}" for node in left if node not in given])
+                    lines.append(f"not all elements of an input are connected: {kept}")
         known = {*self.groups("parameter"), *self.groups("input")}
-        given = {name.partition("[")[0] for name in asked}
-        for group in sorted(given & known):
-            others = [full for name in self.components if (full := f"{name}.{group}") in known - given]
-            if others and self.nodes[self.vector(group)[0]].element == self.recorded:
-                lines.append(f"{group} is set in '{self.recorded}' alone: {', '.join(others)} keeps its value")
+        groups = {name.partition("[")[0] for name in asked}
+        for group in sorted(groups & known):
+            others = [full for name in self.components if (full := f"{name}.{group}") in known - groups]
+            own = {self.nodes[name].element for name in self.vector(group)[:1]} & self.components.keys()
+            lines += [f"{group} is set in '{element}' alone: {_kept(others)}" for element in own if others]
         return lines
 
     @property
@@ -93,6 +96,11 @@ class System(Fmu):
             + f", × {affine.gain:g} + {affine.offset:g}" * (affine != IDENTITY)
             for (source, target, affine), count in groups.items()
         ]
+
+
+def _kept(names: list[str]) -> str:
+    """Return the sentence that variables keep their values."""
+    return f"{', '.join(names)} {'keeps its value' if len(names) == 1 else 'keep their values'}"
 
 
 def load_fmu(path: str | Path, robot: str = "") -> Fmu:
