@@ -769,7 +769,7 @@ def decoded(bag: Path) -> list[tuple[str, Any]]:
 def test_of_several_robots_one_is_chosen(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     elements = component("plant") + component("plant").replace('name="plant"', 'name="left"')
     two = loop(tmp_path / "two.ssp", plant, pd, ssd(f"<ssd:Elements>{elements}</ssd:Elements>"))
-    with pytest.raises(FmuError, match="give one as `robot`: plant, left"):
+    with pytest.raises(FmuError, match=r"choose one by `robot` of 'twodof run', .* load_fmu: plant, left"):
         twodof.load_fmu(two)
     fmu = twodof.load_fmu(two, "left")
     assert fmu.start_values["plant.payload"] == fmu.start_values["payload"] == 0.0

@@ -185,7 +185,8 @@ def _robot(path: Path, fmus: dict[str, Fmu], robot: str) -> str:
         raise FmuError(f"'{path}': '{robot}', the `robot`, has no outputs q[i] and v[i]{choice(robot, robots)}")
     robots = [robot] if robot else robots
     if len(robots) != 1:
-        some = f"; give one as `robot`: {', '.join(robots)}" if robots else f" among {', '.join(fmus)}"
+        by = "by `robot` of 'twodof run', 'twodof info' or the Python function load_fmu"
+        some = f"; choose one {by}: {', '.join(robots)}" if robots else f" among {', '.join(fmus)}"
         raise FmuError(f"'{path}' has {len(robots) or 'no'} components with outputs q[i] and v[i]{some}")
     fmus[robots[0]] = logged(fmus[robots[0]])
     return robots[0]
