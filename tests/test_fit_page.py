@@ -54,6 +54,8 @@ def test_a_page_has_the_verdict_the_parameters_and_the_curves(result: twodof.Fit
                 assert (ground == "rgb(20, 20, 20)") == (scheme == "dark")
                 tables = [each.inner_text() for each in page.locator(TABLES).all()]
                 figures = page.evaluate(CURVES)
+                key, plots = page.get_by_text("Thin: measured; thick: model").bounding_box(), page.locator("#plots")
+                assert key is not None and key["y"] < plots.bounding_box()["y"]  # type: ignore[index]
     assert told.startswith("The model explains these data") and "do not determine payload_com[3]\n" in told
     known = [row for row in result.rows if row[3] != "not determined"]
     assert [row.split("\t") for row in tables[0].splitlines()] == [[*row] for row in known]

@@ -23,7 +23,7 @@ BEFORE = 1  # index of its style
 WIDTHS, DEPTHS = (THIN, THIN, 2.0 * CURVE), (2.5, 1.5, 2.0)  # the measured curve is a line on the model's band
 MOST_OPEN = 15  # rows of a table that is not folded
 SPACE = 1.0  # s between two stretches on the time axis
-BAND = "grey band: held out"
+LINES = "Thin: measured; thick: model; dashed: model before the fit; grey band: held out of the fit."
 
 
 def fit_page(
@@ -52,7 +52,7 @@ def fit_page(
         shown = " open" if k == 0 or len(rows) <= MOST_OPEN else ""
         text += f"<details{shown}><summary>{escape(caption)}</summary><table>{_html(rows)}</table></details>\n"
     content = {"figures": [*_figures(joints, curves)], "rows": [*_legend(joints)]}
-    text += f'<div id="plots"></div>\n{figures_html(content)}'
+    text += f'<p>{LINES}</p>\n<div id="plots"></div>\n{figures_html(content)}'
     return html_of(Drawing(title, "fit", lambda figure: None, [facts], body=lambda: text))
 
 
@@ -78,7 +78,7 @@ def _figures(joints: Mapping[str, str], curves: Sequence[Curve]) -> Iterator[Cha
     for i, (joint, unit) in enumerate(joints.items()):
         unit = "N·m" if unit == "rad" else "N"
         lines = [(curve.effort[:, i], *curve.modelled[:, :, i]) for curve in curves]
-        rows[f"Effort of {joint} in {unit}; {BAND}"] = [_panel("tau", joint, unit, times, lines)]
+        rows[f"Effort of {joint} in {unit}"] = [_panel("tau", joint, unit, times, lines)]
         rest = [(none := np.full_like(effort, np.nan), none, effort - after) for effort, _, after in lines]
         rows[f"Measured less model, {joint} in {unit}"] = [_panel("residual", joint, unit, times, rest)]
     figure = _stacked(rows, times)
