@@ -29,6 +29,16 @@ def runs(tmp_path_factory, native_path):
     return {name: folder / name for name in settings}
 
 
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    """A UR under pose control, and its first sample."""
+    options = twodof.FmuOptions(
+        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
+    )
+    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path_factory.mktemp("posed") / "ur.fmu", options))
+    return fmu, next(twodof.samples(fmu))
+
+
 def test_a_run_that_is_as_asserted_passes(runs):
     assert_settles(runs["good"], within=3.1)
     assert_within_limits(twodof.read_bag(runs["good"]))
@@ -50,13 +60,9 @@ def test_settling_is_that_of_the_error(runs):
         assert_settles(slow, within=3.0)
 
 
-def test_the_error_that_settles_last_is_named(tmp_path):
+def test_the_error_that_settles_last_is_named(tmp_path, posed):
     """The position settles before the orientation, whose gains are low."""
-    options = twodof.FmuOptions(
-        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
-    )
-    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "ur.fmu", options))
-    first = next(twodof.samples(fmu))
+    fmu, first = posed
     goal = (Rotation.from_rotvec([0.0, 0.0, 0.5]) * Rotation.from_quat(first.quat)).as_quat()
     settings = {
         "x_des": np.add(first.x, (0.0, 0.05, 0.0)),
@@ -72,13 +78,9 @@ def test_the_error_that_settles_last_is_named(tmp_path):
         assert_settles(tmp_path / "pose", within=3.3)
 
 
-def test_an_orientation_that_drifts_from_its_target_does_not_settle(tmp_path):
+def test_an_orientation_that_drifts_from_its_target_does_not_settle(tmp_path, posed):
     """The position settles; the last joint turns under an external effort, without a gain of the orientation."""
-    options = twodof.FmuOptions(
-        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
-    )
-    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "ur.fmu", options))
-    first = next(twodof.samples(fmu))
+    fmu, first = posed
     held = {"x_des": np.add(first.x, (0.0, 0.05, 0.0)), "quat_des": first.quat}
     drifts = {"Kp_rot": (0.0,) * 3, "Kd_rot": (3.0,) * 3, "tau_ext[6]": 0.5}
     verdict = twodof.run(fmu, twodof.Bag(tmp_path / "held"), stop_time=4.0, settings=held).verdict
@@ -91,13 +93,9 @@ def test_an_orientation_that_drifts_from_its_target_does_not_settle(tmp_path):
         assert_settles(tmp_path / "drifts", within=4.0)
 
 
-def test_an_orientation_near_its_target_is_not_judged_by_its_rounding_error(tmp_path):
+def test_an_orientation_near_its_target_is_not_judged_by_its_rounding_error(tmp_path, posed):
     """At the second target the error of the orientation is 2e-7 rad, and at the end 5e-5 rad."""
-    options = twodof.FmuOptions(
-        urdf=robots_folder() / UR, frame="tool0", control="pose", native=True, meshes=False, q_start=BENT
-    )
-    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "ur.fmu", options))
-    first = next(twodof.samples(fmu))
+    fmu, first = posed
     goal = (Rotation.from_rotvec([0.0, 0.0, 0.2]) * Rotation.from_quat(first.quat)).as_quat()
     fast = {"Kp": (50.0,) * 3, "Kd": (15.0,) * 3, "quat_des": goal, "x_des": np.add(first.x, (0.0, 0.05, 0.0))}
     verdict = twodof.run(

@@ -54,9 +54,8 @@ static void damped_system(const Step *step, double s, DampedSystem *system)
     mass_matrix(joint, end_body, inertia, L);
     for (int i = 0; i < N_JOINTS; i++)
         for (int j = 0; j < i; j++)
-            if ((system->held[i] && step->stops.held[i] != CLAMPED)
-                || (system->held[j] && step->stops.held[j] != CLAMPED))
-                L[i][j] = 0.0; /* a clamped joint moves, as the other joints see it */
+            if (reacts(&step->stops, i) || reacts(&step->stops, j)) /* for the others, a clamped joint moves on */
+                L[i][j] = 0.0;
     for (int k = N_JOINTS - 1; k > 0; k--)
         for (int i = k - 1; i >= 0; i--)
             if (L[k][i] != 0.0) {
