@@ -94,16 +94,18 @@ class Trial:
         }
 
     def changed_discrete(self) -> dict[str, float | bool]:
-        """Return values of integers, enumerations and Booleans that differ from their start values."""
+        """Return values in their ranges of integers, enumerations and Booleans that differ from their start values."""
         values: dict[str, float | bool] = {}
         for name, start in self.discrete_starts.items():
-            items = [item for item in self.fmu.variables[name].items.values() if item != start]
-            if isinstance(start, bool):
-                values[name] = not start
-            elif items:
-                values[name] = items[0]
-            elif not isinstance(start, str) and self.fmu.variables[name].type != "Enumeration":
-                values[name] = start - 1 if start > 1 else start + 1
+            if isinstance(start, str):
+                continue
+            kind = self.fmu.variables[name].value_type
+            numbers = [start - 1, start + 1] if start > 1 else [start + 1, start - 1]
+            items = [item for item in kind.items.values() if item != start]
+            others = [not start] if isinstance(start, bool) else items if kind.name == "Enumeration" else numbers
+            allowed = [other for other in others if kind.low <= other <= kind.high]
+            if allowed:
+                values[name] = allowed[0]
         return values
 
     def require(self, *claims: str) -> None:
