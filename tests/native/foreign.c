@@ -13,7 +13,7 @@ enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES,
        KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER, FLUSHES,
        DESTROYS, READS_STEER, NOT_EXACT, NOT_CONSTANT, WRONG_TIME, KEEPS_HANDLE, LEAVES_POINTER,
        ONE_STATE, NOT_FINITE_AT_START, SMALL_SLOPE, WRONG_TEXT, WRONG_ITEM, KEEPS_TEXT, LOSES_ITEM, READS_TWO,
-       DERIVATIVES_STEER };
+       DERIVATIVES_STEER, ROUNDS, STRICT };
 #ifndef X
 #define X 1.0
 #endif
@@ -86,7 +86,8 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
     for (size_t i = 0; i < n; i++) {
         int defined = FAULT != (m->t > 0.0 ? NOT_FINITE : NOT_FINITE_AT_START);
         double value[] = {0.0, m->u, FAULT == NOT_EXACT ? m->x + 0.5 : m->x, m->u - m->x,
-                          defined ? y_of(m) : NAN, m->p, 0.0, 0.0, 1e-8 * m->u,
+                          defined ? y_of(m) : NAN, m->p, 0.0, 0.0,
+                          FAULT == ROUNDS ? (1e-3 * m->u + 3e5) - 3e5 : 1e-8 * m->u,
                           FAULT == WRONG_TIME ? 1.01 * m->t : m->t, FAULT == NOT_CONSTANT ? 9.8 : 9.81};
         if (r[i] > 10 && FAULT == FRAGILE) abort();
         if (r[i] > 10) return fmi2Error;
@@ -152,7 +153,7 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
         dz[i] = 0.0;
         for (size_t k = 0; k < (FAULT == ONE_SEED ? 1 : nv); k++) {
             double of_y = v[k] == 1 ? 2.0 : 1.0, of_rate = v[k] == 1 ? 1.0 : -1.0;
-            double of_z = v[k] == 1 ? FAULT == SMALL_SLOPE ? 5e-8 : 1e-8 : 0.0;
+            double of_z = v[k] == 1 ? FAULT == SMALL_SLOPE ? 5e-8 : FAULT == ROUNDS ? 1e-3 : 1e-8 : 0.0;
             of_y *= FAULT == WRONG_SLOPE ? 1.00001 : 1.0;
             dz[i] += dv[k] * (z[i] == 8 ? of_z : z[i] == 4 ? of_y : of_rate);
         }
@@ -178,6 +179,7 @@ fmi2Status fmi2GetBoolean(fmi2Component c, R r, size_t n, fmi2Boolean v[]) {
     return fmi2OK;
 }
 fmi2Status fmi2SetInteger(fmi2Component c, R r, size_t n, const fmi2Integer v[]) {
+    if (FAULT == STRICT && r[0] == 7 && v[0] != 3) abort();
     if (v[0] > 3) return fmi2Error;
     *(r[0] == 11 ? &((M *)c)->item : &((M *)c)->k) = v[0];
     return fmi2OK;

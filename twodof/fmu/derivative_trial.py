@@ -20,6 +20,10 @@ SMOOTH, EXACT = 1e-3, 1e-7
 magnitude or to 1. The tolerance is this difference, plus EXACT relative to the derivative's magnitude, plus the effect
 of rounding.
 """
+NEAR, SCATTER = (0.9, 0.9137, 0.9291, 0.9473, 0.9649, 0.9831), 4.0
+"""If a derivative differs from the quotients, quotients of these fractions of the width are taken too. They differ by
+the rounding of terms within the FMU, which no output shows, and SCATTER times their spread is added to the tolerance.
+"""
 ULPS = 32.0  # spacings of numbers by which an output may be rounded, at the magnitude of its terms or its nominal value
 Array = NDArray[np.float64]
 
@@ -87,16 +91,31 @@ class Point:
         found = zip(states, instance.reader(states)())
         return [name for name, value in found if abs(value - far[name]) > 0.5 * self._widths[name]]
 
-    def slopes(self, instance: Instance, name: str, change: Callable[[Mapping[str, float]], object]) -> Slopes:
-        """Return the slopes over a variable, which is changed by a function."""
+    def slopes(
+        self, instance: Instance, name: str, change: Callable[[Mapping[str, float]], object], given: Array
+    ) -> Slopes:
+        """Return the slopes over a variable, which is changed by a function, to be compared with given derivatives."""
         read, width = instance.reader(self.unknowns), self._widths[name]
-        low, high, lower, higher = rows = np.empty((4, len(self.unknowns)))
-        for row, delta in zip(rows, (-0.5 * width, 0.5 * width, -width, width)):
-            change({name: self.values[name] + delta})
-            row[:] = read()
-        wide, narrow = (higher - lower) / (2.0 * width), (high - low) / width
-        rounding = ULPS * np.spacing(np.maximum(self.sizes, np.abs(rows).max(axis=0))) / width
-        return Slopes((4.0 * narrow - wide) / 3.0, np.abs(narrow - wide) + rounding)
+
+        def around(part: float) -> Array:
+            rows = np.empty((2, len(self.unknowns)))
+            for row, sign in zip(rows, (-1.0, 1.0)):
+                change({name: self.values[name] + sign * part * width})
+                row[:] = read()
+            return rows
+
+        def quotient(rows: Array, part: float) -> Array:
+            return np.asarray((rows[1] - rows[0]) / (2.0 * part * width))
+
+        near, far = around(0.5), around(1.0)
+        narrow, wide = quotient(near, 0.5), quotient(far, 1.0)
+        largest = np.maximum(self.sizes, np.abs([*near, *far]).max(axis=0))
+        doubt = np.abs(narrow - wide) + ULPS * np.spacing(largest) / width
+        found = Slopes((4.0 * narrow - wide) / 3.0, doubt)
+        if not found.differ(given).any():
+            return found
+        spread = np.ptp([quotient(around(part), part) for part in NEAR], axis=0)
+        return Slopes(found.best, doubt + SCATTER * spread)
 
     def go_on(self, instance: Instance, steps: int = 0) -> None:
         """Do some steps and a part of a step, or a whole one if the step may not vary."""
@@ -111,7 +130,7 @@ class Point:
         self._trial.begin_again(instance, self.values)
         self.go_on(instance)
         given = instance.derivatives(self.unknowns, [name])[:, 0]
-        slopes = self.slopes(instance, name, instance.set)
+        slopes = self.slopes(instance, name, instance.set, given)
         return ~slopes.smooth | slopes.differ(given)
 
     def holds(self, instance: Instance, state: str) -> NDArray[np.bool_]:
@@ -154,7 +173,7 @@ def _check_later(trial: Trial, instance: Instance, point: Point) -> None:
     trial.begin_again(instance, point.values)
     point.go_on(instance, steps)
     for given, name in zip(_given(trial, instance, point, names).T, names):
-        slopes = point.slopes(instance, name, instance.set)
+        slopes = point.slopes(instance, name, instance.set, given)
         instance.set({name: point.values[name]})
         wrong = slopes.differ(given) & (slopes.best != 0.0)
         if wrong.any():
@@ -184,7 +203,7 @@ def derivatives(trial: Trial) -> str:
             trial.begin_again(instance, {**point.values, **values})
 
         for given, name in zip(stated.T, point.values):
-            slopes = point.slopes(instance, name, at_start)
+            slopes = point.slopes(instance, name, at_start, given)
             jumps += int((~slopes.smooth).sum())
             wrong = slopes.differ(given)
             if wrong.any() and name in trial.inputs:
