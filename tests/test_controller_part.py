@@ -330,6 +330,22 @@ def test_a_split_robot_is_the_whole(ssp: Path, fmi: int, tmp_path: Path) -> None
     assert (starts["controller.payload"], starts["payload"], starts["rigid_stops"]) == (0.1, 0.1, False)
 
 
+@pytest.mark.parametrize("turn", [0.3, 1.2])
+def test_the_orientation_of_a_split_robot_is_judged_as_that_of_the_whole(fmi: int, turn: float, tmp_path: Path) -> None:
+    """The final error is the angle between the target and the arm, which rotates about z by the sum of its joints."""
+    options: dict[str, Any] = {"native": True, "control": "pose", "fmi": fmi, "settings": {"control_period": 0.01}}
+    verdicts = []
+    for part, name in (("all", "arm.fmu"), ("split", "arm.ssp")):
+        path = twodof.build_fmu(tmp_path / name, twodof.FmuOptions(part=part, **options))
+        settings = {"quat_des": (0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2)), "Kp_rot": 1e-3}
+        verdicts.append(twodof.simulate(path, settings=settings).verdict)
+        *_, last = twodof.samples(path, settings=settings)
+        error = verdicts[-1].numbers["final_turn_error"]
+        np.testing.assert_allclose(error, abs(turn - sum(last.q)), rtol=0, atol=1e-9)
+    assert verdicts[0].outcome == verdicts[1].outcome == "not reached" and error > 0.1
+    assert verdicts[0].numbers == pytest.approx(verdicts[1].numbers, rel=1e-9, abs=1e-12)
+
+
 def test_a_split_robot_has_a_picture_of_its_components_and_connections(ssp: Path) -> None:
     """In the documentation, and as the geometry of a diagram, in which components do not overlap."""
     with zipfile.ZipFile(ssp) as archive:

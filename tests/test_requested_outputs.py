@@ -1,4 +1,4 @@
-"""Mass matrix, nonlinear effects, Jacobian and drift as outputs on request, against Pinocchio."""
+"""Outputs on request: mass matrix, Jacobian, orientation and others, against Pinocchio."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from twodof.cli.main import main
 from twodof.errors import BuildError
 from twodof.files import data_file
 
-ALL = ("M", "h", "J", "drift")
+ALL = ("M", "h", "J", "drift", "quat", "omega")
 V = (0.3, -0.8, 0.5, 1.1, -0.4, 0.9, -1.3)
 PAYLOAD, COM, ARMATURE = 1.5, (0.02, -0.01, 0.05), 0.1
 FLAVOURS: dict[str, dict[str, Any]] = {
@@ -24,6 +24,9 @@ FLAVOURS: dict[str, dict[str, Any]] = {
     "native 2": {"native": True},
     "native 3": {"native": True, "fmi": 3},
     "scalars": {"native": True, "fmi": 3, "arrays": False},
+    "bare python": {"control": "effort"},
+    "bare native": {"control": "effort", "native": True},
+    "joint native": {"control": "joint", "native": True},
 }
 
 
@@ -43,9 +46,8 @@ def test_they_are_pinocchios(panda: str, tmp_path: Path, flavour: str) -> None:
     """With a payload and rotors, at a state in motion."""
     urdf = tmp_path / "panda.urdf"
     urdf.write_text(panda)
-    options = twodof.FmuOptions(
-        urdf, frame="panda_hand_tcp", meshes=False, control="pose", outputs=ALL, **FLAVOURS[flavour]
-    )
+    given = {"control": "pose", "outputs": ALL, **FLAVOURS[flavour]}
+    options = twodof.FmuOptions(urdf, frame="panda_hand_tcp", meshes=False, **given)
     path = twodof.build_fmu(tmp_path / "panda.fmu", options)
     sample, signals = outputs(
         path, q_start=REST["panda"], v_start=V, payload=PAYLOAD, payload_com=COM, armature=ARMATURE
@@ -70,6 +72,9 @@ def test_they_are_pinocchios(panda: str, tmp_path: Path, flavour: str) -> None:
     pin.forwardKinematics(model, data, q, v, np.zeros(7))
     drift = pin.getFrameClassicalAcceleration(model, data, frame, aligned).vector
     np.testing.assert_allclose([signals[f"drift[{i}]"] for i in range(1, 7)], drift, **exact)
+    np.testing.assert_allclose([signals[f"omega[{i}]"] for i in (1, 2, 3)], (J @ v)[3:], **exact)
+    quat = pin.Quaternion(data.oMf[frame].rotation).coeffs()
+    np.testing.assert_allclose(sample.quat, quat * np.sign(quat[3]), **exact)
     described = {v.name: v.dimensions for v in fmpy.read_model_description(path).modelVariables}
     assert [int(size.start) for size in described["M" if flavour == "native 3" else "M[1,7]"]] == (
         [7, 7] if flavour == "native 3" else []
@@ -95,3 +100,5 @@ def test_others_are_refused(tmp_path: Path) -> None:
         twodof.FmuOptions(outputs=("m",))
     with pytest.raises(BuildError, match="outputs of the plant, which the controller alone"):
         twodof.FmuOptions(part="controller", native=True, outputs=("M",))
+    with pytest.raises(BuildError, match="quat and omega need a `control` other than 'task'"):
+        twodof.FmuOptions(outputs=("omega",))

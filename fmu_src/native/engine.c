@@ -2,7 +2,7 @@
    numbers for derivatives. Each file uses only files that are included before it. */
 #include "turn.c"
 #include "mechanism.c"
-#if N_ROWS > N_AXES
+#ifdef HAS_QUAT
 #include "orientation.c"
 #endif
 #if !COMMANDS_ACCELERATION

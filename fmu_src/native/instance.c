@@ -57,7 +57,7 @@ static Status check_range(Instance *instance, int variable, double value)
 /* True if the control law can follow the inputs; a refusal is logged. */
 static Status check_inputs(Instance *instance)
 {
-#if N_ROWS > N_AXES
+#ifdef HAS_QUAT_DES
     const double *quat = &instance->state.plant.value[QUAT_DES];
     if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
         return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is not an orientation; the identity"

@@ -33,6 +33,7 @@ INTERNAL void quaternion(double R[3][3], double q[4])
         q[c] *= sign;
 }
 
+#ifdef HAS_QUAT_DES
 /* log(R_des Rᵀ), the shortest rotation from R to R_des, rad about the root's axes, at most π. The target is the
    quaternion of R_des, of any length but 0. */
 INTERNAL void rotation_error(const double target[4], double R[3][3], double error[3])
@@ -54,3 +55,4 @@ INTERNAL void rotation_error(const double target[4], double R[3][3], double erro
     error[1] = factor * y;
     error[2] = factor * z;
 }
+#endif

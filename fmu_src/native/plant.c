@@ -306,10 +306,15 @@ static void compute_equations(Plant *plant, const JointPosition joint[N_BODIES],
 #ifdef HAS_DRIFT
     memcpy(&plant->value[DRIFT], task->drift, sizeof task->drift);
 #endif
+#ifdef HAS_QUAT
+    quaternion(task->R, &plant->value[QUAT]);
+#endif
+#ifdef HAS_OMEGA
+    memcpy(&plant->value[OMEGA], &task->xd[N_AXES], 3 * sizeof *task->xd);
+#endif
 }
 
-/* Compute the outputs x and xd, with an orientation quat and omega, and on request M, h, J and drift, at the plant's
-   state. */
+/* Compute the outputs x and xd, and those on request, at the plant's state. */
 INTERNAL void compute_position(Plant *plant)
 {
     JointPosition joint[N_BODIES];
@@ -320,10 +325,6 @@ INTERNAL void compute_position(Plant *plant)
         plant->value[X + k] = task.x[k];
         plant->value[XD + k] = task.xd[k];
     }
-#if N_ROWS > N_AXES
-    quaternion(task.R, &plant->value[QUAT]);
-    memcpy(&plant->value[OMEGA], &task.xd[N_AXES], 3 * sizeof *task.xd);
-#endif
     compute_equations(plant, joint, &task);
 }
 

@@ -49,8 +49,10 @@ def add(build: Parser) -> None:
     flag("--clocked", help=text)
     text = "build plant and controller as two native FMUs, connected in an SSP file"
     option("--split", action="store_const", dest="part", const="split", help=text)
-    text = "add outputs: mass matrix M, nonlinear effects h, Jacobian J, drift dJ/dt v"
-    option("--with", dest="outputs", nargs="+", choices=("M", "h", "J", "drift"), default=[], help=text)
+    text = "add outputs: mass matrix M, nonlinear effects h, Jacobian J, drift dJ/dt v, orientation quat, angular"
+    text += " velocity omega"
+    names = ("M", "h", "J", "drift", "quat", "omega")
+    option("--with", dest="outputs", nargs="+", choices=names, default=[], help=text)
     text = "make a parameter an input, with derivatives (--native): gravity, payload, payload_com, 'friction[*]',"
     text += " 'damping[*]', 'armature[*]', mass:LINK, com:LINK, inertia:LINK; repeatable"
     build.add_repeatable("--free", metavar="PATTERN", help=text)

@@ -16,7 +16,7 @@ import pythonfmu
 from ..errors import BuildError
 from ..files import data_file
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Starts, Variable
+from ..plant.variables import CONTROLS, OF_ORIENTATION, Starts, Variable
 from .bodies import FreeLink
 from .compiler import EXTENSIONS, UNITS, compile_library, standard_headers
 from .fmi3_files import build_description, terminals_and_icons
@@ -78,12 +78,12 @@ def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Starts)
     )
 
 
-def engine_sources(control: str, fmi: int = 2) -> Files:
-    """Return the engine's C files with one control law and the functions of one FMI version."""
+def engine_sources(control: str, fmi: int = 2, outputs: Sequence[str] = ()) -> Files:
+    """Return the engine's C files with one control law, requested outputs and the functions of one FMI version."""
     law = "task" if control == "pose" else control
     left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
     left_out |= set() if law == "task" else {"pseudo_inverse.c", "task_slopes.c"}
-    left_out |= set() if control == "pose" else {"orientation.c"}
+    left_out |= set() if OF_ORIENTATION & {*CONTROLS[control].outputs, *outputs} else {"orientation.c"}
     left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c", "clock.c"}
     return {
         path.name: path.read_bytes() for path in data_file("fmu_src", "native").iterdir() if path.name not in left_out
@@ -101,7 +101,7 @@ def native_flavour(
     """Return the native flavour: the plant as C99 sources, compiled for the platforms."""
     name, control, arrays = options.name, options.control, options.arrays and fmi == 3
     headers = standard_headers()
-    sources = engine_sources(control, fmi)
+    sources = engine_sources(control, fmi, options.outputs)
     sources["mechanism.c"] = mechanism_source(robot, table, links).encode()
     if fmi == 2:  # in 3.0 the importer provides them, so that compilers check arguments
         sources |= {file: text for file, text in headers.items() if file.startswith("fmi2")}

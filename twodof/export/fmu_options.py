@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..errors import BuildError, choice
-from ..plant.variables import CONTROLS, FREE, OF_LINKS, ON_REQUEST
+from ..plant.variables import CONTROLS, FREE, OF_LINKS, OF_ORIENTATION, ON_REQUEST
 
 DEFAULT_NAME = "TwoDof"
 OF_THE_FLAVOUR = ("mesh_dir", "meshes", "link_environment", "native", "fmi", "arrays", "platforms", "reference")
@@ -29,7 +29,8 @@ class FmuOptions:
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else (0, 0, −9.81).
         q_start: start positions, rad or m, in the order of the joints or by name; default: the shipped arm's
             positions, or 0 if it is within the limits, or the middle of the limits.
-        outputs: further outputs for controllers: "M" mass matrix, "h" nonlinear effects, "J" Jacobian, "drift" J̇ v.
+        outputs: further outputs for controllers: "M" mass matrix, "h" nonlinear effects, "J" Jacobian, "drift" J̇ v,
+            "quat" orientation, "omega" angular velocity. With one of the last two, J and drift have rows of rotations.
         free: parameters that become inputs of a native FMU: they may change during a run, and the FMU has derivatives
             with respect to them. Each is a group of ``FREE``, or a value of a link as in ``fit``: ``mass:LINK``,
             ``com:LINK`` or ``inertia:LINK``, where LINK is a name or shell pattern.
@@ -89,6 +90,8 @@ class FmuOptions:
         for name in self.outputs:
             if name not in ON_REQUEST:
                 raise BuildError(f"`outputs` '{name}' is unknown{choice(name, ON_REQUEST)}")
+        if self.control == "task" and OF_ORIENTATION & {*self.outputs}:
+            raise BuildError("`outputs` quat and omega need a `control` other than 'task', for example 'pose'")
         for name in self.free:
             group, _, link = name.partition(":")
             if name not in FREE and not (group in OF_LINKS and link):
@@ -97,7 +100,7 @@ class FmuOptions:
         if self.free and (not self.native or self.part != "all"):
             raise BuildError("`free` needs the whole robot as a native FMU, `native=True`")
         if self.part == "controller" and self.outputs:
-            raise BuildError("M, h, J and drift are outputs of the plant, which the controller alone does not have")
+            raise BuildError("`outputs` are outputs of the plant, which the controller alone does not have")
         if self.part == "split" and self.control == "effort":
             raise BuildError("a split robot needs a control law other than 'effort', which is the plant alone")
         if self.part != "all" and self.reference:

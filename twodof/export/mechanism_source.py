@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from ..plant.robot import Robot
-from ..plant.variables import OF_LINKS, Variable
+from ..plant.variables import OF_LINKS, OF_ORIENTATION, Variable
 from .bodies import Array, Body, FreeLink, JointTree, joint_tree
 from .derivatives import ROOT, joint_force, joint_frame, joint_motion, joint_motions, joint_positions, joint_ratios
 from .recursions import (
@@ -37,7 +37,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable], links: Sequence[Fr
     x, R, J, drift = task_frame(constants, joint, v)
     rows = ["xyz".index(axis) for axis in robot.axes]
     frame = _elements("task->x", x[rows])
-    if any(variable.group == "quat_des" for variable in table):
+    if any(variable.group in OF_ORIENTATION for variable in table):
         rows += [3, 4, 5]
         frame |= _elements("task->R", R)
     frame |= _elements("task->J", J[rows]) | _elements("task->drift", drift[rows])

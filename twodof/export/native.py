@@ -10,7 +10,7 @@ import numpy as np
 
 from ..plant.regime import BUDGET
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, OF_LINKS, ON_REQUEST, RANGES, Variable, count_event_indicators
+from ..plant.variables import CONTROLS, OF_LINKS, OF_ORIENTATION, ON_REQUEST, RANGES, Variable, count_event_indicators
 
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_INTEGER": "seed", "FIRST_BOOLEAN": "v_from_q"}
 """First group of each part of the table: outputs, parameters, and among these integers and Booleans."""
@@ -44,13 +44,13 @@ def model_header(
         f"#define FMI {fmi}\n#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {len(robot.joints)} /* that move on their own */\n"
         f"#define N_BODIES {robot.model.njoints - 1} /* of which some may follow others */\n"
-        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n",
+        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * (not OF_ORIENTATION.isdisjoint(groups))}\n",
         f"#define BUDGET {BUDGET} /* evaluations of the equations of motion in one communication step, at most */\n"
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         f"#define IS_CONTROLLER {int(is_controller)} /* the control law alone: q and v are inputs */\n"
         f"#define IS_CLOCKED {int(clocked)} /* an importer with event mode ticks the samples */\n"
-        + "".join(f"#define HAS_{group.upper()}\n" for group in ("rcond", *ON_REQUEST) if group in groups),
+        + "".join(f"#define HAS_{group.upper()}\n" for group in ("rcond", "quat_des", *ON_REQUEST) if group in groups),
         f"enum {{ N_FREE = {n_free} }}; /* parameters that are inputs */\n"
         + (f"#define N_LINK_VALUES {len(known)} /* values of links among them */\n" if known else ""),
         _groups(groups, {**FIRST, "FIRST_OUTPUT": "x"} if is_controller else FIRST),

@@ -63,6 +63,7 @@ def system_files(options: FmuOptions) -> tuple[Files, Mapping[str, Files]]:
             options,
             part="all",
             control="effort",
+            outputs=(*options.outputs, *law.outputs),
             name=f"{options.name}_plant",
             settings={"rigid_stops": law.rigid_stops, **of_plant},
         ),

@@ -26,7 +26,7 @@ from .regime import BUDGET, StepError
 from .robot import Robot
 from .sampling import Sampling, advance_sampled, sampling_refusal
 from .stops import Stops
-from .variables import CONTROLS, RANGES, Variable
+from .variables import CONTROLS, OF_ORIENTATION, RANGES, Variable
 
 LAWS: dict[str, ControlLaw] = {
     "task": task_control,
@@ -86,7 +86,7 @@ class Plant(ControlledPlant):
         self.v = list(self.v_start)
         self.sampling = Sampling.begin(len(self.q), self.time)
         self._axes = ["xyz".index(axis) for axis in robot.axes]
-        self._rows = [*self._axes, 3, 4, 5] if control == "pose" else self._axes
+        self._rows = [*self._axes, *((3, 4, 5) if OF_ORIENTATION & {v.group for v in table} else ())]
         self._swing = robot.swing()
         self.prepare()
 

@@ -132,7 +132,9 @@ CONTROLS = {
 "pose" is "task" with three more rows.
 """
 
-ON_REQUEST = ("M", "h", "J", "drift")  # groups of outputs that only ``FmuOptions.outputs`` adds
+ON_REQUEST = ("M", "h", "J", "drift", "quat", "omega")
+"""Groups of outputs that only ``FmuOptions.outputs`` or the control law adds."""
+OF_ORIENTATION = {"quat", "omega"}  # groups of outputs with which J and drift have rows of rotations too
 DISTURBANCES = ("tau_ext", "f_ext")
 FREE = ("gravity", "payload", "payload_com", "friction", "damping", "armature")
 """Groups of parameters that may be inputs, which can change during a run and have derivatives."""
@@ -143,7 +145,7 @@ OF_THE_PLANT = {
     *("friction", "damping", "integrator", "rigid_stops"),
 }
 """Groups that a controller alone does not have."""
-OF_A_LAW = {group for law in CONTROLS.values() for group in (*law.outputs, *law.parameters)}
+OF_A_LAW = {group for law in CONTROLS.values() for group in law.parameters}
 
 ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ...] = (
     ("x_des", "input", "axis", "m", None, "target position"),
@@ -228,11 +230,12 @@ def variable_table(
     starts = {**of_robot, "Kn": 10.0 if redundant else 0.0, "rigid_stops": law.rigid_stops, **starts}
     if "q_des" in law.inputs:
         starts.setdefault("q_des", starts["q_start"])
-    owners = _owners(robot, law)
+    requested = {*law.outputs, *outputs}
+    owners = _owners(robot, law, bool(OF_ORIENTATION & requested))
     table: list[Variable] = []
     for group, causality, owner, unit, default, text in ROWS:
-        own = group in (*law.inputs, *law.outputs, *law.parameters)
-        if group in ON_REQUEST and group not in outputs:
+        own = group in (*law.inputs, *law.parameters)
+        if group in ON_REQUEST and group not in requested:
             continue
         if not (own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES):
             continue
@@ -281,12 +284,16 @@ def controller_table(table: Sequence[Variable]) -> list[Variable]:
     return rows
 
 
-def _owners(robot: Robot, law: Control) -> dict[str, list[str]]:
-    """Return, for each kind of owner, a phrase for the description of each element."""
+def _owners(robot: Robot, law: Control, rotates: bool) -> dict[str, list[str]]:
+    """Return, for each kind of owner, a phrase for the description of each element.
+
+    Args:
+        rotates: whether the task contains rotations.
+    """
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
     turn = [f"about axis {letter} of {robot.root}" for letter in "xyz"]
-    task = [*axis, *turn] if "quat_des" in law.inputs else axis
+    task = [*axis, *turn] if rotates else axis
     return {
         "": [],
         "joint": joint,
