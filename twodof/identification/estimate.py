@@ -67,6 +67,9 @@ def estimate(
     """
     solutions, interrupted = _solutions(parameters, stretches), False
     solution = next(solutions)
+    for i, joint in enumerate(parameters.robot.joints):
+        if i not in [each.joint for each in solution.rows]:
+            raise InputError(f"joint '{joint}' reverses too often for a fit: record slower motions of it")
     try:
         finished()
         for better in solutions:
@@ -75,6 +78,16 @@ def estimate(
     except KeyboardInterrupt:
         interrupted = True
     return _result(parameters, stretches, *solution, interrupted)
+
+
+def unexplained(parameters: Parameters, stretches: Sequence[Stretch]) -> Array:
+    """Return the residual power of each joint as a part of that of its efforts, or 1 if a joint has no rows, n."""
+    *_, (rows, _, z, _, _) = _solutions(parameters, stretches)
+    dynamics, parts = parameters.dynamics(parameters.values(z[:-1])), np.ones(len(parameters.robot.joints))
+    for each in rows:
+        left = np.sum(residual(each, dynamics, float(z[-1])) ** 2)
+        parts[each.joint] = left / max(float(np.sum(each.tau**2)), 1e-300)
+    return parts
 
 
 def _solutions(parameters: Parameters, stretches: Sequence[Stretch]) -> Iterator[_Solution]:

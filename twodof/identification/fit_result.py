@@ -65,7 +65,7 @@ class Fit:
         misfits: test of the model at each joint.
         suspects: errors of the setup that the residuals show, for which the intervals are wider.
         holds: rests of joints under a load that is larger than their friction.
-        locks: remarks on locked joints that are elsewhere in the bags.
+        doubts: remarks on locked joints that are elsewhere in the bags, and on efforts that may be wrong.
         fragile: largest change of each parameter, in standard deviations, by constant errors of efforts that the data
             cannot show.
         noise: standard deviation of the efforts' residuals at each joint, N·m or N.
@@ -90,7 +90,7 @@ class Fit:
     misfits: tuple[Misfit, ...]
     suspects: tuple[Suspect, ...]
     holds: tuple[Hold, ...]
-    locks: tuple[str, ...]
+    doubts: tuple[str, ...]
     fragile: Mapping[str, float]
     noise: tuple[float, ...]
     delay: tuple[float, float]
@@ -159,7 +159,7 @@ class Fit:
             )
         if not lines:
             lines.append("the model explains these data: its residuals are noise")
-        lines += self.locks
+        lines += self.doubts
         groups = {parameter.name.partition(":")[0] for parameter in self.parameters}
         if "gain" in groups and "mass" not in groups:
             lines.append(

@@ -26,7 +26,7 @@ from .estimate import NORMAL_95, PASSES, Estimate, estimate
 from .fit_result import Fit, FittedParameter, check_folder
 from .fitted_urdf import fitted_urdf
 from .parameters import Dynamics, Parameters
-from .recording_checks import GRAVITY, check_external, check_units, moved_locks, recorded_gravity
+from .recording_checks import GRAVITY, check_external, check_signs, check_units, moved_locks, recorded_gravity
 from .stretches import Array, jumps, stretches
 
 if TYPE_CHECKING:
@@ -129,17 +129,18 @@ def fit(
     given, recordings = recordings, [with_efforts(each, controller) for each in recordings]
     parameters = model.parameters(gravity)
     fitted, held = stretches(recordings, model.robot)
-    check_units(parameters, fitted, recordings)
+    doubts = check_units(parameters, fitted, recordings)
     finished = _counter(progress, PASSES + 2 * len(held))
     found = estimate(parameters, fitted, finished)
     models = [(parameters.dynamics(parameters.given), 0.0), (parameters.dynamics(found.values), found.delay[0])]
     try:
+        doubts += check_signs(parameters, fitted, recordings, found)
         compared = compare(model.robot, models, fitted, [] if found.interrupted else held, finished)
     except KeyboardInterrupt:
         found = found._replace(interrupted=True)
         compared = compare(model.robot, models, fitted, [], finished)
     given = [raw if raw.tau.size else each for raw, each in zip(given, recordings)]
-    result = _result(model, parameters, found, compared, given, options.get("lock") or {})
+    result = _result(model, parameters, found, compared, given, doubts, options.get("lock") or {})
     if output is not None:
         result.save(output)
     return result
@@ -190,6 +191,7 @@ def _result(
     found: Estimate,
     compared: Comparison,
     recordings: Sequence[Recording],
+    doubts: tuple[str, ...],
     locks: Mapping[str, float],
 ) -> Fit:
     robot = model.robot
@@ -204,7 +206,7 @@ def _result(
         misfits=found.misfits,
         suspects=found.suspects,
         holds=found.holds,
-        locks=moved_locks(recordings, locked_positions(model.urdf, locks)),
+        doubts=doubts + moved_locks(recordings, locked_positions(model.urdf, locks)),
         fragile=dict(zip(parameters.names, found.fragile.tolist())),
         noise=tuple(found.noise.tolist()),
         delay=found.delay,

@@ -41,6 +41,7 @@ OF_JOINTS = {
 }
 """Units of rotating and of sliding joints."""
 OF_THE_ROBOT = ("payload", "payload_com", "gravity")
+OF_MOTION = ("friction", "damping", "armature")
 OF_THE_SETUP = ("gravity", "offset", "gain", "bias")
 EXPONENTS, BOUNDED = ("mass", "gain"), ("friction", "damping", "armature", "payload")
 """Groups of values exp(x), and groups of values that are at least 0."""
@@ -49,7 +50,9 @@ SCALES = {"mass": 1.0, "gain": 1.0, "gravity": 0.5, "com": 0.1, "payload_com": 0
 """Scales of coordinates that do not depend on the robot: deviations so large that the coordinate would be unknown."""
 ROWS, COLUMNS = np.tril_indices(3)
 LEAST_MOMENT = 1e-3  # fraction of m·(5 cm)²: smallest initial second moments of mass of a free inertia
-LEAST_PAYLOAD = 0.01  # fraction of the moving mass: smallest initial payload if its position is free
+LEAST_PAYLOAD = 0.1
+"""Fraction of the moving mass: smallest initial payload if its position is free. From a smaller one, a first step that
+reduces the load would end at a payload of 0, whose position has no effect."""
 SEEN = 0.5  # the data determine a direction if its standard deviation is below this fraction of the parameters' scales
 
 
@@ -180,6 +183,13 @@ class Parameters:
         if any(free.group in ("payload", "payload_com") for free in self.free):
             bodies.add(self._end[0])
         return np.array([10 * body + k for body in sorted(bodies - {-1}) for k in range(10)], np.int64)
+
+    def with_friction(self, moving: NDArray[np.bool_]) -> Parameters:
+        """Free friction, damping and armature of the joints that move, and none of their parameters that do not."""
+        more = copy(self)
+        known = (free for _, free in self._known() if free in self.free or free.group in OF_MOTION)
+        more.free = [free for free in known if free.group not in (*OF_MOTION, "bias") or moving[free.number]]
+        return more
 
     def with_errors(self, x: Array) -> tuple[Parameters, Array, NDArray[np.bool_]]:
         """Free all of OF_THE_SETUP in addition; return the parameters, their coordinates, and which of them are new."""

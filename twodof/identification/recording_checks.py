@@ -1,6 +1,6 @@
 """Checks of recordings before a fit: gravity, external efforts, locked joints, units, signs and order of efforts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, count
 from typing import Any
 
@@ -12,9 +12,11 @@ from ..errors import InputError
 from ..files import shown
 from ..plant.robot import Robot
 from ..plant.variables import DISTURBANCES
+from .estimate import Estimate, unexplained
+from .model_tests import LEAST_NOISE
 from .parameters import Parameters
 from .regression import regressors
-from .stretches import Array, Stretch
+from .stretches import Array, Stretch, thinned
 
 GRAVITY = (0.0, 0.0, -9.81)
 SURE, SEPARATE = 10.0, 1e-6
@@ -23,8 +25,12 @@ LEAST_LOAD = 1e-3
 """Load of a joint by gravity in one direction, as part of that in others, below which it is an error of rounding."""
 WRONG_UNITS = 300.0  # ratio of recorded efforts to those of the URDF's masses, above which another unit is suspected
 WRONG_RANGE = 3.0  # ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected
-EXCHANGED = 0.3  # part of the residual power of a joint's efforts, below which those of another joint explain them
+BETTER = 0.3  # ratio of residual powers, below which one explanation of efforts is much better than another
+EXPLAINED = 0.1  # part of the power of efforts that is not explained, below which the fault of a refusal is certain
+MOST_TRIED = 10_000  # samples of a bag with which a correction is tried
 LOCKED = 0.02  # rad or m: distance of a locked joint from its position, above which a remark names it
+Fault = tuple[Array, str, str]
+"""Matrix n × n that corrects efforts by multiplication from the right, text of the fault, and remedy."""
 
 
 def recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
@@ -72,12 +78,37 @@ def moved_locks(recordings: Sequence[Recording], positions: Mapping[str, float])
     return tuple(remarks)
 
 
-def check_units(parameters: Parameters, fitted: Sequence[Stretch], recordings: Sequence[Recording]) -> None:
-    """Refuse a bag whose positions or efforts seem to have wrong units, signs or joints."""
+def check_units(parameters: Parameters, fitted: Sequence[Stretch], recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Refuse a bag whose positions or efforts have wrong units, signs or joints; return remarks on uncertain ones."""
+    remarks = []
+    for bag, own in _by_bag(fitted, recordings):
+        _check_positions(parameters.robot, own, bag)
+        _check_recorded(parameters.robot.joints, own, bag)
+        remarks += _check_efforts(parameters, own, bag, _suspicions(parameters, max(own, key=lambda each: len(each.t))))
+    return tuple(remarks)
+
+
+def check_signs(
+    parameters: Parameters, fitted: Sequence[Stretch], recordings: Sequence[Recording], found: Estimate
+) -> tuple[str, ...]:
+    """Refuse a bag that a poor fit explains only with reversed efforts of one joint; return remarks on uncertain ones.
+
+    With an unknown payload, a reversed joint can have a load of the expected sign.
+    """
+    least = EXPLAINED**0.5 if found.converged else 0.0
+    if found.interrupted or not any(misfit.bad and misfit.part > least for misfit in found.misfits):
+        return ()
+    joints, turning, remarks = parameters.robot.joints, np.flatnonzero(~np.array(parameters.robot.prismatic)), []
+    for bag, own in _by_bag(fitted, recordings):
+        reversals = (_reversal(joints, wrong, "seem to have the wrong sign") for wrong in turning[:, None])
+        remarks += _check_efforts(parameters, own, bag, reversals, BETTER)
+    return tuple(remarks)
+
+
+def _by_bag(fitted: Sequence[Stretch], recordings: Sequence[Recording]) -> Iterator[tuple[str, list[Stretch]]]:
     for bag, recording in enumerate(recordings):
         if own := [stretch for stretch in fitted if stretch.bag == bag]:
-            _check_positions(parameters.robot, own, shown(recording.path))
-            _check_efforts(parameters, max(own, key=lambda each: len(each.t)), shown(recording.path))
+            yield shown(recording.path), own
 
 
 def _check_positions(robot: Robot, fitted: Sequence[Stretch], bag: str) -> None:
@@ -93,73 +124,109 @@ def _check_positions(robot: Robot, fitted: Sequence[Stretch], bag: str) -> None:
             )
 
 
-def _check_efforts(parameters: Parameters, stretch: Stretch, bag: str) -> None:
-    """Refuse efforts that differ much from those of the URDF's masses."""
+def _check_recorded(joints: Sequence[str], own: Sequence[Stretch], bag: str) -> None:
+    for i, joint in enumerate(joints):
+        if not any(each.tau[:, i].any() for each in own):
+            raise InputError(f"'{bag}': the effort of joint '{joint}' is 0 throughout: it was not recorded")
+
+
+def _check_efforts(
+    parameters: Parameters, own: Sequence[Stretch], bag: str, faults: Iterable[Fault], most: float = 1.0 / BETTER
+) -> list[str]:
+    """Refuse efforts that the free parameters explain only after the correction of a fault; return remarks.
+
+    Friction, damping and armature are free here, because most URDFs lack them, and because they show the sign: they are
+    not negative.
+
+    Args:
+        most: ratio of the residual powers with and without the correction, below which a fault is remarked.
+    """
+    own, remarks, recorded = thinned(own, MOST_TRIED), list[str](), np.empty(0)
+    # where a position is constant, its speed is not 0 but an error of rounding
+    moving = [each.moving.any(axis=0) & (np.ptp(each.measured, axis=0) > 0.0) for each in own]
+    model = parameters.with_friction(np.any(moving, axis=0))
+    for correction, fault, remedy in faults:
+        recorded = recorded if recorded.size else unexplained(model, own)
+        corrected = unexplained(model, [each._replace(tau=each.tau @ correction) for each in own])
+        changed = (correction != np.eye(len(correction))).any(axis=0)
+        ratio = np.median(((corrected + LEAST_NOISE**2) / (recorded + LEAST_NOISE**2))[changed])
+        if ratio < BETTER and np.median(corrected[changed]) < EXPLAINED:
+            raise InputError(f"'{bag}': the recorded efforts {fault}: {remedy}")
+        if ratio <= most:
+            remarks.append(f"'{bag}': the recorded efforts {fault}; if this is no error of the URDF, {remedy}")
+    return remarks[:1]
+
+
+def _reversal(joints: Sequence[str], wrong: NDArray[np.int64], fault: str) -> Fault:
+    """Return the fault of reversed efforts of joints."""
+    signs = np.where(np.isin(np.arange(len(joints)), wrong), -1.0, 1.0)
+    return np.diag(signs), f"of {_named(joints, wrong)} {fault}", "reverse the efforts, or correct `gravity`"
+
+
+def _suspicions(parameters: Parameters, stretch: Stretch) -> Iterator[Fault]:
+    """Yield faults of the order, units and signs of efforts that differ much from those of the URDF's masses."""
     robot, values = parameters.robot, parameters.dynamics(parameters.start)
     few = stretch.part(slice(None, None, max(1, len(stretch.t) // 200)))
     Y, G = regressors(robot, few, values, np.empty(0, np.int64))
     model = Y[:, :, 0] + np.einsum("g,kgi->ki", values.gravity, G[:, :, :, 0])
-    for joint, effort in zip(robot.joints, few.tau.T):
-        if not effort.any():
-            raise InputError(f"'{bag}': the effort of joint '{joint}' is 0 throughout: it was not recorded")
     motions = zip(G[:, :, :, 0].transpose(2, 0, 1), Y[:, :, 0].T, few.v.T, few.a.T)
     signals = [np.column_stack([loads, inertia, np.sign(v), v, a]) for loads, inertia, v, a in motions]
-    _check_order(robot.joints, few.tau, signals, bag)
+    one = np.eye(len(robot.joints))
+    best = _order(few.tau, signals)
+    if len(moved := np.flatnonzero(best != np.arange(len(best)))):
+        fault = f"{_named(robot.joints, moved)} seem to be those of {_named(robot.joints, best[moved])}, in this order"
+        yield one[:, np.argsort(best)], f"of {fault}", "correct the order of the efforts"
     scales = np.array([_scale(values.gravity, *each) for each in zip(few.tau.T, signals)])
     theirs, ours = (np.sqrt(np.mean(each**2, axis=0)) for each in (few.tau, model))
     for slides, units in ((False, ("N·m", "N·mm", "kN·m")), (True, ("N", "mN", "kN"))):
         own = np.flatnonzero(np.array(robot.prismatic) == slides)
         joints = [robot.joints[i] for i in own]
-        _check_scales(joints, np.abs(scales[own]), theirs[own], ours[own], units, bag)
+        for wrong, factor, fault in _wrong_units(joints, np.abs(scales[own]), theirs[own], ours[own], units):
+            correction = one.copy()
+            correction[own[wrong], own[wrong]] /= factor
+            yield correction, fault, "convert them, or correct the masses"
     own = np.flatnonzero((scales < 0.0) & ~np.array(robot.prismatic))
-    if len(own):
-        raise InputError(
-            f"'{bag}': the recorded efforts of {_named(robot.joints, own)} have the opposite sign of"
-            " those of the URDF's masses: reverse the efforts, or correct `gravity`"
-        )
+    for wrong in [own, *own[:, None]] if len(own) > 1 else own[:, None]:
+        yield _reversal(robot.joints, wrong, "have the opposite sign of those of the URDF's masses")
 
 
-def _check_order(joints: Sequence[str], tau: Array, signals: Sequence[Array], bag: str) -> None:
-    """Refuse efforts that the signals of other joints explain much better than those of their own."""
+def _order(tau: Array, signals: Sequence[Array]) -> NDArray[np.int64]:
+    """Return the joint whose signals explain the efforts of each joint, where other joints do so much better."""
     bases = [np.linalg.qr(each / np.maximum(np.linalg.norm(each, axis=0), 1e-300))[0] for each in signals]
     left = np.array([np.sum((tau - U @ (U.T @ tau)) ** 2, axis=0) for U in bases])  # by signals and efforts
-    best = left.argmin(axis=0)
-    moved = np.flatnonzero(left.min(axis=0) < EXCHANGED * np.diag(left))
-    if len(moved) and sorted(best[moved]) == moved.tolist():
-        raise InputError(
-            f"'{bag}': the recorded efforts of {_named(joints, moved)} seem to be those of"
-            f" {_named(joints, best[moved])}, in this order: correct the order of the efforts"
-        )
+    best = np.where(left.min(axis=0) < BETTER * np.diag(left), left.argmin(axis=0), np.arange(len(left)))
+    return best if len(set(best.tolist())) == len(best) else np.arange(len(best))
 
 
 def _named(joints: Sequence[str], indices: NDArray[np.int64]) -> str:
     return f"joint{'s' * (len(indices) > 1)} {', '.join(repr(joints[i]) for i in indices.tolist())}"
 
 
-def _check_scales(
-    joints: Sequence[str], scales: Array, theirs: Array, ours: Array, units: tuple[str, str, str], bag: str
-) -> None:
-    """Refuse recorded efforts of joints of one kind that are far larger or smaller than those of the URDF's masses.
+def _wrong_units(
+    joints: Sequence[str], scales: Array, theirs: Array, ours: Array, units: tuple[str, str, str]
+) -> Iterator[tuple[NDArray[np.int64], float, str]]:
+    """Yield the joints, factor and text of efforts far larger or smaller than those of the URDF's masses.
 
     Args:
+        joints: names of the joints of one kind.
         scales: ratios of recorded to expected efforts; NaN if unknown.
         theirs, ours: root mean squares of recorded and expected efforts.
         units: the right unit, and units a thousandth and a thousand times as large.
     """
-    usual = np.exp(np.median(np.log(scales[known]))) if (known := np.isfinite(scales)).any() else 1.0
+    usual = float(np.exp(np.median(np.log(scales[known])))) if (known := np.isfinite(scales)).any() else 1.0
     if not 1.0 / WRONG_UNITS < usual < WRONG_UNITS:
-        raise InputError(
-            f"'{bag}': the recorded efforts are {usual:.2g} times those of the URDF's masses: they are probably not in"
-            f" {units[0]}, but for example in {units[1 + (usual < 1.0)]}, a factor of 1000; convert them, or"
-            " correct the masses"
+        fault = (
+            f"are {usual:.2g} times those of the URDF's masses: they are probably not in"
+            f" {units[0]}, but for example in {units[1 + (usual < 1.0)]}, a factor of 1000"
         )
-    high = np.flatnonzero(scales > WRONG_UNITS).tolist()  # a payload can do so to a light wrist, but not to it alone
+        yield np.arange(len(joints)), usual, fault
+    high = np.flatnonzero(scales > WRONG_UNITS)  # a payload can do so to a light wrist, but not to it alone
     if len(high) == 1 and theirs[high[0]] == max(theirs.max(), ours.max()):
-        raise InputError(
-            f"'{bag}': the recorded efforts of joint '{joints[high[0]]}' are {scales[high[0]]:.2g} times those of the"
-            f" URDF's masses, unlike those of other joints: they are probably in {units[1]}, a factor of 1000; convert"
-            " them, or correct the masses"
+        fault = (
+            f"of joint '{joints[high[0]]}' are {scales[high[0]]:.2g} times those of the"
+            f" URDF's masses, unlike those of other joints: they are probably in {units[1]}, a factor of 1000"
         )
+        yield high, float(scales[high[0]]), fault
 
 
 def _scale(given: Array, tau: Array, signals: Array) -> float:

@@ -22,7 +22,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from ..errors import InputError
 from ..plant.robot import Robot
 from .inertials import model_with
 from .parameters import Dynamics, Parameters
@@ -94,7 +93,7 @@ def regressors(robot: Robot, stretch: Stretch, values: Dynamics, varying: NDArra
 def rows_of(
     parameters: Parameters, values: Dynamics, stretches: Sequence[Stretch], delay: float, with_offsets: bool
 ) -> list[Rows]:
-    """Return the rows of each joint, linearised at values of the parameters and a delay of the efforts, s."""
+    """Return the rows of each joint that has some, linearised at values of the parameters and a delay of efforts, s."""
     found: list[list[Rows]] = [[] for _ in parameters.robot.joints]
     for stretch in stretches:
         rows_in = projector(parameters, values, stretch, delay, with_offsets)
@@ -106,10 +105,7 @@ def rows_of(
                 if end - begin >= LEAST_SAMPLES and keep:
                     bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
                     rows.append(rows_in(i, slice(begin, end), smooth_basis(end - begin, keep), bins))
-    for joint, rows in zip(parameters.robot.joints, found):
-        if not rows:
-            raise InputError(f"joint '{joint}' reverses too often for a fit: record slower motions of it")
-    return [_joined(rows) for rows in found]
+    return [_joined(rows) for rows in found if rows]
 
 
 def resting_rows(

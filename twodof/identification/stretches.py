@@ -128,7 +128,7 @@ def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stret
                 f"joint '{joint}' never moves beyond the noise of its positions: lock it with `lock`, or record it"
                 " moving"
             )
-    return _thinned(fitted, MOST_FITTED, "for the fit"), _thinned(held, MOST_HELD, "held out")
+    return thinned(fitted, MOST_FITTED, "for the fit"), thinned(held, MOST_HELD, "held out")
 
 
 def _unwrapped(recording: Recording, robot: Robot, q: Array) -> Array:
@@ -187,10 +187,13 @@ def _check_spikes(recording: Recording, robot: Robot, q: Array) -> None:
             )
 
 
-def _thinned(whole: Sequence[Stretch], most: int, purpose: str) -> list[Stretch]:
-    """Return the stretches in pieces; of more samples than ``most``, the beginning of each piece."""
+def thinned(whole: Sequence[Stretch], most: int, purpose: str = "") -> list[Stretch]:
+    """Return the stretches in pieces; of more samples than ``most``, the beginning of each piece.
+
+    With a purpose, a warning states the numbers of samples.
+    """
     samples, pieces = sum(len(stretch.t) for stretch in whole), []
-    if samples > most:
+    if samples > most and purpose:
         LOG.warning(f"of {samples} samples {purpose}, {most} are used, evenly spread in pieces")
     for stretch in whole:
         cuts = np.linspace(0, len(stretch.t), -(-len(stretch.t) // PIECE) + 1).astype(int).tolist()
