@@ -466,6 +466,92 @@ def test_a_target_is_in_the_coordinates_in_which_its_controller_reads_the_robot(
     assert (outcome != "no target") == (name == "q_des")
 
 
+EFFORT = "pd.tau[1] plant.tau_cmd[1], pd.tau[2] plant.tau_cmd[2]"
+BEHIND = "plant.q[1] gear.q[1], plant.q[2] gear.q[2], gear.tau[1] pd.q[1], gear.tau[2] pd.q[2]"
+SEEN = "plant.q[1] pd.monitor[1], plant.q[2] pd.monitor[2]"
+AS_ANGLE = {f'name="q[{i}]"': f'name="angle[{i}]"' for i in (1, 2)}
+
+
+@pytest.mark.parametrize(
+    ("measured", "renamed", "why"),
+    [
+        (f"{STRAIGHT}, plant.q[2] pd.elbow", {'name="v[1]"': 'name="elbow"'}, ""),
+        (f"{STRAIGHT}, plant.q[1] pd.elbow 10", {'name="v[1]"': 'name="elbow"'}, ""),
+        (f"{STRAIGHT}, plant.q[1] pd.monitor[2], plant.q[2] pd.monitor[1]", {}, ""),
+        (f"{STRAIGHT}, plant.q[1] pd.monitor[1] 10, plant.q[2] pd.monitor[2] 10", {}, ""),
+        (BEHIND.replace("pd.q", "pd.monitor") + f", {STRAIGHT}", {}, ""),
+        (BEHIND, {}, "q reads the robot through gear"),
+        (f"{BEHIND}, {SEEN}", {}, "q reads the robot through gear"),
+        (
+            BEHIND.replace("pd.q", "pd.monitor") + ", " + STRAIGHT.replace("pd.q", "pd.angle"),
+            AS_ANGLE,
+            "monitor reads the robot through gear",
+        ),
+        (f"{BEHIND}, {SEEN}".replace("pd.q", "pd.angle"), AS_ANGLE, "angle reads the robot through gear"),
+        (f"{GEARED}, {SEEN}", {}, "q reads the robot in another order, with another conversion, or in part"),
+        (
+            f"{GEARED}, {SEEN}".replace("pd.q", "pd.angle"),
+            AS_ANGLE,
+            "angle reads the robot in another order, with another conversion, or in part",
+        ),
+        ("plant.q[1] pd.elbow", {'name="v[1]"': 'name="elbow"'}, "the controller reads no positions of the robot"),
+        (
+            f"plant.q[1] pd.angle[1], {SEEN}",
+            AS_ANGLE,
+            "angle reads the robot in another order, with another conversion, or in part",
+        ),
+        (f"{STRAIGHT}, gear.tau[1] pd.q_des[1], gear.tau[2] pd.q_des[2]", {}, "its values come from gear"),
+    ],
+)
+def test_further_inputs_of_a_controller_neither_remove_a_target_nor_prove_one(
+    measured: str, renamed: dict[str, str], why: str, plant: bytes, tmp_path: Path
+) -> None:
+    """Monitors, and positions that come through a gear; a verdict says why it judges no target."""
+    replaced = {'unit="rad/s"': 'unit="rad"', **renamed}
+    if not any('"v[' in name for name in renamed):
+        replaced |= {f'name="v[{i}]"': f'name="monitor[{i}]"' for i in (1, 2)}
+    controller, scaled = pd_fmu(replaced=replaced), {'unit="N.m"': 'unit="rad"', 'name="q_des': 'name="level'}
+    gear = {"resources/gear.fmu": pd_fmu(effort="10.0 * c->value[Q + i]", replaced=scaled)}
+    elements = BOTH.replace("</ssd:Elements>", f"{component('gear')}</ssd:Elements>")
+    structure = ssd(f"{elements}<ssd:Connections>{_wires(measured)}{_wires(EFFORT)}</ssd:Connections>")
+    path = loop(tmp_path / "loop.ssp", plant, controller, structure, **gear)
+    assert bool(twodof.load_fmu(path).vector("q_des")) == (not why)
+    verdict = twodof.run(path, step=H, stop_time=N * H).verdict
+    assert (verdict.outcome == "no target") == bool(why)
+    notes = [line for line in verdict.lines if "is not judged" in line]
+    assert notes == ([f"note: pd.q_des is not judged: {why}"] if why else [])
+
+
+def test_a_target_of_an_inner_system_has_its_short_name(plant: bytes, pd: bytes, tmp_path: Path) -> None:
+    """The names with the inner system and with the controller are those of the same input."""
+    kinds = {"q": "input", "v": "input", "q_des": "input", "tau": "output"}
+    ports = connectors({f"{name}[{i}]": kind for i in (1, 2) for name, kind in kinds.items()})
+    pairs = [(f"{name}[{i}]", f"pd.{name}[{i}]") for name in kinds for i in (1, 2)]
+    wires = "".join(connection(*(pair[::-1] if "tau" in pair[0] else pair)) for pair in pairs)
+
+    def system(name: str) -> str:
+        parts = f"<ssd:Elements>{component('pd')}</ssd:Elements><ssd:Connections>{wires}</ssd:Connections>"
+        return f'<ssd:System name="{name}">{ports}{parts}</ssd:System>'
+
+    outer = WIRES.replace('"pd"', '"ctl"')
+    elements = f"<ssd:Elements>{component('plant')}{system('ctl')}</ssd:Elements>"
+    path = loop(tmp_path / "loop.ssp", plant, pd, ssd(f"{elements}<ssd:Connections>{outer}</ssd:Connections>"))
+    gains = {"ctl__pd__Kp": 0.1, "ctl__pd__Kd": 0.01}
+    expected = by_hand(plant, tmp_path / "plant.fmu")
+    for name in ("q_des", "ctl__q_des"):
+        np.testing.assert_array_equal(q_of(path, **gains, **{name: TARGET}), expected)
+    assert twodof.run(path, step=H, stop_time=N * H).verdict.outcome != "no target"
+    second = connection("ctl.tau[1]", "plant.tau_cmd[1]") + connection("more.tau[2]", "plant.tau_cmd[2]")
+    read = "".join(_wires(f"plant.{g}[{i}] {s}.{g}[{i}]") for g in "qv" for i in (1, 2) for s in ("ctl", "more"))
+    both = f"<ssd:Elements>{component('plant')}{system('ctl')}{system('more')}</ssd:Elements>"
+    path = loop(tmp_path / "two.ssp", plant, pd, ssd(f"{both}<ssd:Connections>{read}{second}</ssd:Connections>"))
+    found = twodof.load_fmu(path)
+    assert found.vector("ctl.q_des") and found.vector("more.q_des") and not found.vector("q_des")
+    assert found.unjudged == tuple(
+        f"{name}.pd.q_des is not judged: there are several such targets" for name in ("ctl", "more")
+    )
+
+
 def test_only_the_controllers_of_the_chosen_robot_have_its_target(plant: bytes, pd: bytes, tmp_path: Path) -> None:
     """A second robot with its own controller, and a spare controller."""
     left = [text.replace('"p', '"left_p') for text in (component("plant"), component("pd"), WIRES)]

@@ -193,7 +193,7 @@ def _print_system(system: System) -> None:
         ("robot", f"{robot}: {', '.join(system.joints)}"),
         *(("" if i else "FMUs", f"{name}: {_origin(fmu)}, FMI {fmu.version}.0") for i, (name, fmu) in enumerate(parts)),
         *(("" if i else "connections", text) for i, text in enumerate(system.connections or ["none"])),
-        *(("" if i else "remarks", text) for i, text in enumerate(system.remarks())),
+        *(("" if i else "remarks", text) for i, text in enumerate([*system.remarks(), *system.unjudged])),
     )
 
 

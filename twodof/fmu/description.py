@@ -47,6 +47,7 @@ class Fmu:
         described: size of its description, bytes.
         inside: name of the FMU's file in the system at ``path``; "" if ``path`` is the FMU.
         aliases: in a system, further names of variables and vectors, and the names that they stand for.
+        unjudged: in a system, reasons for which targets of the robot's controllers are not judged, a line each.
     """
 
     path: Path
@@ -63,6 +64,7 @@ class Fmu:
     described: int = 0
     inside: str = ""
     aliases: Mapping[str, str] = field(default_factory=dict)
+    unjudged: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"

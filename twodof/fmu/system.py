@@ -151,7 +151,9 @@ def load_system(path: Path, robot: str = "") -> System:
     chosen = _robot(path, fmus, robot)
     starts, ignored = _bound(path, wiring)
     numbers = {node: value for node, value in starts.items() if not isinstance(value, str)}
-    variables, nodes = _variables(path, wiring, fmus, links, numbers, chosen, _measuring(fmus, links, chosen))
+    goals, unjudged = targets_of(wiring, fmus, links, chosen)
+    measuring = _measuring(fmus, links, chosen)
+    variables, nodes = _variables(path, wiring, fmus, links, numbers, chosen, measuring, goals)
     digest = hashlib.sha256(structure)
     for fmu in by_source.values():
         digest.update(f"{fmu.guid} {sorted(fmu.members.items())}\0".encode())
@@ -161,7 +163,7 @@ def load_system(path: Path, robot: str = "") -> System:
     for name, node in nodes.items():
         if (full := str(node)) != name and node.element:
             aliases |= {full: name, full.rpartition("[")[0] or full: name.rpartition("[")[0] or name}
-    own = dict(variables=variables, description=description, control="", aliases=aliases)
+    own = dict(variables=variables, description=description, control="", aliases=aliases, unjudged=unjudged)
     return System(
         **{**vars(fmus[chosen]), **own},
         recorded=chosen,
@@ -256,11 +258,12 @@ def _variables(
     starts: Mapping[Node, float | bool],
     robot: str,
     measuring: str,
+    goals: set[Node],
 ) -> tuple[dict[str, Scalar], dict[str, Node]]:
     """Return the variables of a system, and the component's variable or the connector for each of them.
 
-    Names without a component are those of the robot, except for measured values, and those of the system's connectors.
-    A connector that could be mistaken for a vector of the robot is "system.connector".
+    Names without a component are those of the robot, except for measured values, those of the system's connectors, and
+    ``goals``, its targets. A connector that could be mistaken for a vector of the robot is "system.connector".
     """
     variables: dict[str, Scalar] = {}
     nodes: dict[str, Node] = {}
@@ -272,7 +275,6 @@ def _variables(
         variables[name] = replace(scalar, name=name, causality=causality, start=text)
         nodes[name] = node
 
-    goals = targets_of(wiring, fmus, links, robot)
     driven: dict[Node, list[Link]] = {}
     for link in (link for link in links if link.source.element not in fmus):
         driven.setdefault(link.source, []).append(link)
@@ -287,9 +289,10 @@ def _variables(
         start = starts.get(source, inverted.pop() if len(inverted) == 1 else None)
         typed = None if start is None else _typed(path, source, first, start)
         assert not isinstance(typed, str)  # connections have numbers and Booleans
-        plain = source in goals or source.connector.partition("[")[0] not in RECORDED
+        plain = source.element or source in goals or source.connector.partition("[")[0] not in RECORDED
+        name = source.connector if source in goals else str(source) if plain else f"system.{source}"
         scalar = replace(first, unit=wiring.unit(source).name or first.unit)
-        add(str(source) if plain else f"system.{source}", source, scalar, causality, typed)
+        add(name, source, scalar, causality, typed)
     ends = {link.target for link in links}
     names = Counter(name for fmu in fmus.values() for name in fmu.variables)
     for element in (robot, *(name for name in fmus if name != robot)):

@@ -45,6 +45,7 @@ class Setup(NamedTuple):
         step: communication step, s.
         starts: start values of all inputs and parameters.
         links: inertial values of links that are inputs, as the controller's model has them.
+        unjudged: reasons for which targets are not judged, a line each.
     """
 
     joints: tuple[str, ...]
@@ -58,6 +59,7 @@ class Setup(NamedTuple):
     step: float
     starts: Mapping[str, float]
     links: Mapping[str, float] = MappingProxyType({})
+    unjudged: tuple[str, ...] = ()
 
     def given(self, group: str, values: Mapping[str, float] | None = None) -> Array:
         """Return the elements of a vector of inputs or parameters, from start values or ``values``; empty if none."""
@@ -144,7 +146,7 @@ def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, flo
     """Return the setup of a run of an FMU with a robot."""
     found = setup(joints=fmu.joints, robot=robot, frame=fmu.frame, axes="".join(fmu.axes), step=step, starts=starts)
     units = tuple(own or fmu.variables[name].unit or "" for own, name in zip(found.units, fmu.vector("q")))
-    return found._replace(units=units, links=_inertials(fmu, robot))
+    return found._replace(units=units, links=_inertials(fmu, robot), unjudged=fmu.unjudged)
 
 
 def _inertials(fmu: Fmu, robot: Urdf | None) -> dict[str, float]:

@@ -75,6 +75,7 @@ def lines_of(
         together,
         *(text for text in also if NEXT in text),
         *notes,
+        *(f"note: {line}" for line in judge.setup.unjudged),
         "" if any(cause.kind == "reach" for cause in why) else _remainder(parts),  # its distance is printed
         _response(judge, outcome, motion, numbers, missed, why),
         _peaks(judge, why, outcome),
