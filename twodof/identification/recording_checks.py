@@ -182,9 +182,11 @@ def _suspicions(parameters: Parameters, stretch: Stretch) -> Iterator[Fault]:
         own = np.flatnonzero(np.array(robot.prismatic) == slides)
         joints = [robot.joints[i] for i in own]
         for wrong, factor, fault in _wrong_units(joints, np.abs(scales[own]), theirs[own], ours[own], units):
-            correction = one.copy()
-            correction[own[wrong], own[wrong]] /= factor
-            yield correction, fault, "convert them, or correct the masses"
+            # with a free payload, the unit alone explains the efforts; with wrong masses, their ratio does
+            for each in (1000.0 ** round(np.log(factor) / np.log(1000.0)), factor):
+                correction = one.copy()
+                correction[own[wrong], own[wrong]] /= each
+                yield correction, fault, "convert them, or correct the masses"
     own = np.flatnonzero((scales < 0.0) & ~np.array(robot.prismatic))
     for wrong in [own, *own[:, None]] if len(own) > 1 else own[:, None]:
         yield _reversal(robot.joints, wrong, "have the opposite sign of those of the URDF's masses")
