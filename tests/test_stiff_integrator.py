@@ -98,6 +98,14 @@ def test_damped_arms_move_as_an_implicit_solver_says(v_start, damping, integrato
     assert np.abs(found[:2] - expected).max() <= 1e-5
 
 
+@pytest.mark.parametrize("damping", [[1e4, 1.2], [4e5, 0.3], [0.1, 1e5], [2e6, 1e-3]])
+def test_a_decay_in_one_joint_moves_the_other_as_an_implicit_solver_says(damping):
+    """While the stiff joint comes to rest, the other moves on; a step that damped the first moved it by 3e-4 rad."""
+    of, changes = engine("twodof"), {"damping": damping, "v_start": [-0.6, -0.66]}
+    found = both(of, shipped(of, **changes), 1)
+    assert np.abs(found[:2] - radau(shipped(of, **changes), STEP)).max() <= 1e-5
+
+
 @pytest.mark.parametrize("damping", [1.0, 30.0, 100.0, 1e3, 1e5, 1e6])
 @pytest.mark.parametrize("speed", [0.0, 0.5])
 def test_a_step_of_a_damped_arm_costs_few_evaluations(speed, damping, monkeypatch):
