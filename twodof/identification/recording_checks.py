@@ -27,6 +27,7 @@ WRONG_UNITS = 300.0  # ratio of recorded efforts to those of the URDF's masses, 
 WRONG_RANGE = 3.0  # ratio of a joint's recorded range of positions to the URDF's, above which another unit is suspected
 BETTER = 0.3  # ratio of residual powers, below which one explanation of efforts is much better than another
 EXPLAINED = 0.1  # part of the power of efforts that is not explained, below which the fault of a refusal is certain
+UNEXPLAINED = 0.5  # part of the power of efforts in a suspect unit that is not explained, above which they are refused
 MOST_TRIED = 10_000  # samples of a bag with which a correction is tried
 LOCKED = 0.02  # rad or m: distance of a locked joint from its position, above which a remark names it
 Fault = tuple[Array, str, str]
@@ -150,7 +151,9 @@ def _check_efforts(
         corrected = unexplained(model, [each._replace(tau=each.tau @ correction) for each in own])
         changed = (correction != np.eye(len(correction))).any(axis=0)
         ratio = np.median(((corrected + LEAST_NOISE**2) / (recorded + LEAST_NOISE**2))[changed])
-        if ratio < BETTER and np.median(corrected[changed]) < EXPLAINED:
+        explained = ratio < BETTER and np.median(corrected[changed]) < EXPLAINED
+        scaled = np.abs(correction[:, changed]).sum(axis=0).max() != 1.0 and np.median(recorded[changed]) > UNEXPLAINED
+        if explained or scaled:
             raise InputError(f"'{bag}': the recorded efforts {fault}: {remedy}")
         if ratio <= most:
             remarks.append(f"'{bag}': the recorded efforts {fault}; if this is no error of the URDF, {remedy}")
@@ -182,11 +185,9 @@ def _suspicions(parameters: Parameters, stretch: Stretch) -> Iterator[Fault]:
         own = np.flatnonzero(np.array(robot.prismatic) == slides)
         joints = [robot.joints[i] for i in own]
         for wrong, factor, fault in _wrong_units(joints, np.abs(scales[own]), theirs[own], ours[own], units):
-            # with a free payload, the unit alone explains the efforts; with wrong masses, their ratio does
-            for each in (1000.0 ** round(np.log(factor) / np.log(1000.0)), factor):
-                correction = one.copy()
-                correction[own[wrong], own[wrong]] /= each
-                yield correction, fault, "convert them, or correct the masses"
+            correction = one.copy()
+            correction[own[wrong], own[wrong]] = 1000.0 ** -round(np.log(factor) / np.log(1000.0))
+            yield correction, fault, "convert them, or correct the masses"
     own = np.flatnonzero((scales < 0.0) & ~np.array(robot.prismatic))
     for wrong in [own, *own[:, None]] if len(own) > 1 else own[:, None]:
         yield _reversal(robot.joints, wrong, "have the opposite sign of those of the URDF's masses")
