@@ -189,7 +189,7 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
             *rate = limiting; /* until the end of the communication step */
         } else {
             const int again = stiff && growth == 1.0; /* errors of stiff modes hardly depend on the step */
-            next = step->size * (again ? MIN_FACTOR * MIN_FACTOR : isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
+            next = step->size * (isfinite(norm) && !again ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
             if (next < 10.0 * (nextafter(end, HUGE_VAL) - end)) {
                 failure->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;

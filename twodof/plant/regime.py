@@ -192,7 +192,7 @@ class Motion:
                 self._rate = rate  # until the end of the communication step
             else:
                 again = stiff and growth == 1.0  # errors of stiff modes hardly depend on the step
-                step *= MIN_FACTOR**2 if again else max(MIN_FACTOR, factor)
+                step *= MIN_FACTOR if again else max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
                 if step < 10 * ulp(end):
                     raise self._too_fast(y, too_fine=True, finite=all(map(isfinite, chain(*K))))
