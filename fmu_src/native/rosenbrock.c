@@ -32,7 +32,7 @@ static const double CUBIC[N_INCREMENTS + 1][4] = {
 static const double STABLE = 3.3, WORTH = 12.0;
 
 /* The system (M + s D) x = τ at y, with joints at rest held: factors of M + s D = Lᵀ Δ L, with L in the lower triangle,
-   whose diagonal is Δ. Factorisation from the leaves to the root keeps the zeros between branches.
+   whose diagonal is Δ⁻¹. Factorisation from the leaves to the root keeps the zeros between branches.
 
    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.5. */
 typedef struct {
@@ -57,14 +57,16 @@ static void damped_system(const Step *step, double s, DampedSystem *system)
         for (int j = 0; j < i; j++)
             if (reacts(&step->stops, i) || reacts(&step->stops, j)) /* for the others, a clamped joint moves on */
                 L[i][j] = 0.0;
-    for (int k = N_JOINTS - 1; k > 0; k--)
+    for (int k = N_JOINTS - 1; k >= 0; k--) {
+        L[k][k] = 1.0 / L[k][k];
         for (int i = k - 1; i >= 0; i--)
             if (L[k][i] != 0.0) {
-                const double factor = L[k][i] / L[k][k];
+                const double factor = L[k][i] * L[k][k];
                 for (int j = 0; j <= i; j++)
                     L[i][j] -= factor * L[k][j];
                 L[k][i] = factor;
             }
+    }
 }
 
 /* x of the system for τ. */
@@ -76,7 +78,7 @@ static void damped_motion(const DampedSystem *system, const double tau[N_JOINTS]
         for (int i = 0; i < k; i++)
             x[i] -= system->L[k][i] * x[k];
     for (int k = 0; k < N_JOINTS; k++) {
-        x[k] /= system->L[k][k];
+        x[k] *= system->L[k][k];
         for (int i = 0; i < k; i++)
             x[k] -= system->L[k][i] * x[i];
     }
