@@ -136,7 +136,7 @@ def test_a_load_whose_cause_is_not_free_is_not_refused(tmp_path):
     """Neither the recorded nor the reversed efforts are those of the URDF."""
     q, tau = motion(ARM, GRAVITY, last=with_mass(0.4, -0.05))
     result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, tau), "friction[*]", gravity=GRAVITY)
-    assert not result.explains and "if this is no error of the URDF, reverse the efforts" in str(result)
+    assert not result.explains and "nor an unknown load, reverse the efforts" in str(result)
 
 
 ROD = """<robot name="rod"><link name="base"/><link name="rod"><inertial><origin xyz="0.1 0 0"/><mass value="{0}"/>
@@ -164,7 +164,7 @@ def test_units_and_signs_that_free_parameters_explain_are_not_refused(
     q, tau = motion(true, HORIZONTAL)
     result = twodof.fit(given, bag_of(tmp_path / "bag", ["hinge"], q - zero, factor * tau), (free, *FRICTION))
     assert next(p for p in result.parameters if p.name.startswith(free[:-1])).after == pytest.approx(truth, rel=0.02)
-    assert ("if this is no error of the URDF, convert them" in str(result)) is remarked
+    assert ("an unknown load, convert them" in str(result)) is remarked
 
 
 def test_a_joint_may_rest_in_one_of_two_bags_with_a_tool(tmp_path):

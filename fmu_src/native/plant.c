@@ -278,7 +278,7 @@ static void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const do
 #endif
 
 /* The outputs on request. */
-static void compute_equations(Plant *plant, const JointPosition joint[N_BODIES], const TaskFrame *task)
+static void compute_equations(Plant *plant, const JointPosition joint[N_BODIES], TaskFrame *task)
 {
     (void)plant, (void)joint, (void)task;
 #if defined HAS_M || defined HAS_H

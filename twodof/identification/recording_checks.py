@@ -156,7 +156,8 @@ def _check_efforts(
         if explained or scaled:
             raise InputError(f"'{bag}': the recorded efforts {fault}: {remedy}")
         if ratio <= most:
-            remarks.append(f"'{bag}': the recorded efforts {fault}; if this is no error of the URDF, {remedy}")
+            cause = "if this is neither an error of the URDF nor an unknown load"
+            remarks.append(f"'{bag}': the recorded efforts {fault}; {cause}, {remedy}")
     return remarks[:1]
 
 
