@@ -50,7 +50,7 @@ def test_table_is_parquet_with_units_and_provenance(native_path, tmp_path):
     assert table.attrs["units"]["Kp"] == "1/s2" and table.attrs["units"]["overshoot"] == ""
 
 
-GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
+GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "40"]
 
 
 def begin(fmu: Path, output: Path, *options: str) -> subprocess.Popen[str]:
