@@ -4,6 +4,7 @@
 #include "engine.c"
 #include "dormand_prince.c"
 #include "polynomial.c"
+#include "damping.c"
 #include "rosenbrock.c"
 #include "margins.c"
 #include "event_search.c"

@@ -57,6 +57,15 @@ static int all_rest(const Step *step)
     return rest;
 }
 
+/* True if all joints move without friction. */
+static int moves_freely(const Step *step)
+{
+    int free = !step->stops.any_held;
+    for (int i = 0; i < N_JOINTS; i++)
+        free &= step->stops.slip[i] == 0;
+    return free;
+}
+
 static int is_finite(const Step *step)
 {
     for (int stage = 0; stage <= step->stages; stage++)
@@ -151,6 +160,9 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
     const double max_step = step->plant->value[MAX_STEP];
     const int automatic = step->plant->value[INTEGRATOR] == AUTOMATIC;
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
+    Modes modes;
+    modes.age = NONE;
+    int exact = 0; /* whether the decay by damping is that of the modes */
     if (all_rest(step))
         return end;
     const double soon = *rate > 0.0 ? 0.0 : short_step(step, end - t, hold_ends, rank_held, event);
@@ -162,7 +174,7 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
         const int stiff = *rate * step->size > STABLE;
-        const double error = stiff ? rosenbrock(step) : dormand_prince(step);
+        const double error = stiff ? rosenbrock(step, exact ? &modes : NULL) : dormand_prince(step);
         const double share = share_of_tolerance(step);
         const double passed = error < share ? first_event(step, rank_held, event) : 0.0;
         const double norm = (passed > 0.0 ? fmax(error, step->inside) : error) / share;
@@ -181,16 +193,22 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
             step->margin = step->margin_new;
             next = fmin(max_step, step->size * fmax(MIN_FACTOR, fmin(growth, factor)));
             growth = MAX_FACTOR;
+            modes.age += modes.age != NONE;
+            exact = 0;
             continue;
         }
         memset(event, 0, sizeof *event);
         const double limiting = automatic && !stiff ? limiting_rate(step, fmin(max_step, end - t)) : 0.0;
         if (limiting > 0.0) {
             *rate = limiting; /* until the end of the communication step */
+        } else if (stiff && !exact && passed == 0.0 && moves_freely(step)
+                   && (modes.age != NONE || find_modes(step, &modes))) {
+            exact = 1;
         } else {
             const int again = stiff && growth == 1.0; /* errors of stiff modes hardly depend on the step */
             next = step->size * (isfinite(norm) && !again ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
+            exact = exact && (modes.age == 0 || find_modes(step, &modes));
             if (next < 10.0 * (nextafter(end, HUGE_VAL) - end)) {
                 failure->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
                 find_fastest(step, failure);

@@ -30,61 +30,9 @@ static const double CUBIC[N_INCREMENTS + 1][4] = {
 /* Damping rate times step: up to STABLE, Dormand–Prince is stable; if the product with the largest step exceeds WORTH,
    this method is cheaper. */
 static const double STABLE = 3.3, WORTH = 12.0;
-
-/* The system (M + s D) x = τ at y, with joints at rest held: factors of M + s D = Lᵀ Δ L, with L in the lower triangle,
-   whose diagonal is Δ⁻¹. Factorisation from the leaves to the root keeps the zeros between branches.
-
-   Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.5. */
-typedef struct {
-    int held[N_JOINTS];
-    double L[N_JOINTS][N_JOINTS];
-} DampedSystem;
-
-static void damped_system(const Step *step, double s, DampedSystem *system)
-{
-    const double *value = step->plant->value;
-    double inertia[N_JOINTS], (*const L)[N_JOINTS] = system->L;
-    JointPosition joint[N_BODIES];
-    EndBody end_body[N_LOADED];
-    place_joints(step->y, joint);
-    body(value, 0, end_body);
-    for (int i = 0; i < N_JOINTS; i++) {
-        system->held[i] = step->stops.held[i] != FREE;
-        inertia[i] = value[ARMATURE + i] + (system->held[i] ? 0.0 : s * value[DAMPING + i]);
-    }
-    mass_matrix(joint, end_body, inertia, L);
-    for (int i = 0; i < N_JOINTS; i++)
-        for (int j = 0; j < i; j++)
-            if (reacts(&step->stops, i) || reacts(&step->stops, j)) /* for the others, a clamped joint moves on */
-                L[i][j] = 0.0;
-    for (int k = N_JOINTS - 1; k >= 0; k--) {
-        L[k][k] = 1.0 / L[k][k];
-        for (int i = k - 1; i >= 0; i--)
-            if (L[k][i] != 0.0) {
-                const double factor = L[k][i] * L[k][k];
-                for (int j = 0; j <= i; j++)
-                    L[i][j] -= factor * L[k][j];
-                L[k][i] = factor;
-            }
-    }
-}
-
-/* x of the system for τ. */
-static void damped_motion(const DampedSystem *system, const double tau[N_JOINTS], double x[N_JOINTS])
-{
-    for (int i = 0; i < N_JOINTS; i++)
-        x[i] = system->held[i] ? 0.0 : tau[i];
-    for (int k = N_JOINTS - 1; k > 0; k--)
-        for (int i = 0; i < k; i++)
-            x[i] -= system->L[k][i] * x[k];
-    for (int k = 0; k < N_JOINTS; k++) {
-        x[k] *= system->L[k][k];
-        for (int i = 0; i < k; i++)
-            x[k] -= system->L[k][i] * x[i];
-    }
-    for (int k = 0; k < N_JOINTS; k++)
-        x[k] = system->held[k] ? 0.0 : x[k];
-}
+/* Modes decay before the stages if the cube of damping rate times step exceeds UNSEEN. Later steps do not see their effects
+   either, which therefore may only have a share of the tolerances. */
+static const double UNSEEN = 10.0, SHARE_UNSEEN = 0.2;
 
 /* Solve (1 − s T) u = r in place, with the system for s = h γ. */
 static void solve(const DampedSystem *system, double s, const double damping[N_JOINTS], double u[N_STATES])
@@ -99,6 +47,12 @@ static void solve(const DampedSystem *system, double s, const double damping[N_J
     }
 }
 
+/* The larger number; NaN if one of them is NaN, unlike fmax. */
+static double larger(double a, double b)
+{
+    return a > b || isnan(a) ? a : b;
+}
+
 /* Weighted sum of the first increments. */
 static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_INCREMENTS], int count, int i)
 {
@@ -108,12 +62,12 @@ static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_I
     return sum;
 }
 
-/* Fill K and P with the dense output of a step to y_new, where the derivatives are k. */
-static void fill_dense_output(Step *step, double u[N_INCREMENTS][N_STATES], const double k[N_STATES])
+/* Fill K and P with the dense output of a step to y_new, where the derivatives are k. The increments of y are given. */
+static void fill_dense_output(Step *step, const double increment[N_STATES], const double k[N_STATES])
 {
     const double h = step->size, rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
     for (int i = 0; i < N_STATES; i++)
-        step->K[2][i] = (weighted(u, WEIGHT[N_INCREMENTS - 1], N_INCREMENTS - 1, i) + u[N_INCREMENTS - 1][i]) / h;
+        step->K[2][i] = increment[i] / h; /* a difference of states loses digits in short steps */
     for (int i = 0; i < N_JOINTS; i++) {
         const double v = step->y[N_JOINTS + i], v_new = step->y_new[N_JOINTS + i], mean = step->K[2][i];
         const double first = (6.0 * mean - 4.0 * v - 2.0 * v_new) / h;
@@ -130,16 +84,56 @@ static void fill_dense_output(Step *step, double u[N_INCREMENTS][N_STATES], cons
     memcpy(step->K[N_INCREMENTS], k, sizeof step->K[N_INCREMENTS]);
 }
 
-/* Fill y_new, K and P from y and K[0]; return the norm of the error, or a larger one of the velocity changes that neither
-   T nor time explains. A step passes if it is below 1. */
-static double rosenbrock(Step *step)
+/* Norm of the velocity changes that the stages do not see, because they come after a decay during which M⁻¹ D changes. k
+   are the derivatives at y_new. The velocities that have decayed are `fast`, and their displacement is `moved`. */
+static double unseen(Step *step, const Modes *modes, const double k[N_STATES])
 {
-    const double h = step->size, *damping = &step->plant->value[DAMPING];
+    const double h = step->size, *v = step->y + N_JOINTS, *v_new = step->y_new + N_JOINTS;
+    double lost[N_JOINTS], part[N_JOINTS], fast[N_JOINTS] = {0}, moved[N_JOINTS] = {0}, fast_2 = 0.0, moved_2 = 0.0;
+    double y[N_STATES], a[N_JOINTS], effort[N_JOINTS], change[N_STATES] = {0};
+    for (int i = 0; i < N_JOINTS; i++)
+        lost[i] = v[i] - v_new[i];
+    in_modes(modes, lost, part);
+    for (int m = 0; m < N_JOINTS; m++) {
+        const double z = modes->rate[m] * h, seen = UNSEEN / (UNSEEN + z * z * z);
+        for (int i = 0; i < N_JOINTS && seen < 1.0; i++) {
+            fast[i] += modes->V[m][i] * ((1.0 - seen) * part[m]);
+            moved[i] += modes->V[m][i] * ((1.0 - seen) * part[m] / modes->rate[m]);
+        }
+    }
+    for (int i = 0; i < N_JOINTS; i++) {
+        fast_2 += fast[i] * fast[i];
+        moved_2 += moved[i] * moved[i];
+    }
+    if (moved_2 == 0.0)
+        return 0.0;
+    const double rate = sqrt(fast_2 / moved_2);
+    memcpy(y, step->y_new, sizeof y);
+    for (int i = 0; i < N_JOINTS; i++)
+        y[N_JOINTS + i] += rate * moved[i];
+    evaluate(step, y, a, effort, NULL);
+    for (int i = 0; i < N_JOINTS; i++)
+        change[N_JOINTS + i] = (a[i] - k[N_JOINTS + i]) / rate + fast[i]; /* T is −rate in each mode */
+    return error_norm(step, change);
+}
+
+/* Fill y_new, K and P from y and K[0]; return the norm of the error, or a larger one of the velocity changes that neither
+   T nor time explains. A step passes if it is below 1. With modes, the method integrates the difference from their exact
+   decay. */
+static double rosenbrock(Step *step, const Modes *modes)
+{
+    const double h = step->size, *damping = &step->plant->value[DAMPING], *v = step->y + N_JOINTS;
     double u[N_INCREMENTS][N_STATES], Tu[N_INCREMENTS][N_STATES], k[N_STATES], error[N_STATES], *y_new = step->y_new;
-    double by_T[N_STATES], rest[N_INCREMENTS + 1][N_STATES], unexplained[N_STATES] = {0};
+    double by_T[N_STATES], rest[N_INCREMENTS + 1][N_STATES], unexplained[N_STATES] = {0}, increment[N_STATES];
+    double a[N_JOINTS], change[N_STATES] = {0}, rates[N_STATES] = {0}, rates_before[N_STATES] = {0};
     DampedSystem system;
     damped_system(step, h * GAMMA, &system);
     memcpy(k, step->K[0], sizeof k);
+    if (modes) {
+        in_modes(modes, step->K[0] + N_JOINTS, a);
+        memset(k, 0, sizeof k);
+        memcpy(rates_before, step->K[0], sizeof rates_before);
+    }
     for (int stage = 0; stage < N_INCREMENTS; stage++) {
         for (int i = 0; i < N_STATES; i++)
             Tu[stage][i] = u[stage][i] = GAMMA * (h * k[i] + weighted(u, COUPLING[stage], stage, i));
@@ -147,27 +141,34 @@ static double rosenbrock(Step *step)
         for (int i = 0; i < N_STATES; i++)
             Tu[stage][i] = (u[stage][i] - Tu[stage][i]) / (h * GAMMA);
         const int next = stage + 1, last = next == N_INCREMENTS;
+        if (modes)
+            decay(modes, v, a, last ? h : NODE[next] * h, change, rates);
         for (int i = 0; i < N_STATES; i++) {
-            y_new[i] = last ? y_new[i] + u[stage][i] : step->y[i] + weighted(u, WEIGHT[next], next, i);
+            increment[i] = last ? weighted(u, WEIGHT[stage], stage, i) + u[stage][i] : weighted(u, WEIGHT[next], next, i);
+            increment[i] += change[i];
+            y_new[i] = step->y[i] + increment[i];
             by_T[i] = last ? by_T[i] + Tu[stage][i] : weighted(Tu, WEIGHT[next], next, i);
         }
         memcpy(k, y_new + N_JOINTS, N_JOINTS * sizeof *k);
         evaluate(step, y_new, k + N_JOINTS, step->effort[next], last ? &step->margin_new : NULL);
-        for (int i = N_JOINTS; i < N_STATES; i++)
-            rest[next][i] = h * (k[i] - step->K[0][i] - by_T[i]);
+        for (int i = 0; i < N_STATES; i++)
+            rest[next][i] = h * (k[i] - rates[i] - (step->K[0][i] - rates_before[i]) - by_T[i]);
+        for (int i = 0; !last && i < N_STATES; i++)
+            k[i] -= rates[i];
     }
-    fill_dense_output(step, u, k);
+    fill_dense_output(step, increment, k);
     for (int i = 0; i < N_STATES; i++)
         error[i] = weighted(u, ESTIMATE, N_INCREMENTS, i);
     for (int stage = 1; stage < N_INCREMENTS; stage++)
         for (int i = N_JOINTS; i < N_STATES; i++)
-            unexplained[i] = fmax(unexplained[i], fabs(rest[stage][i] - NODE[stage] * rest[N_INCREMENTS][i]));
-    step->inside = error_norm(step, error);
+            unexplained[i] = larger(unexplained[i], fabs(rest[stage][i] - NODE[stage] * rest[N_INCREMENTS][i]));
+    step->inside = modes ? HUGE_VAL : error_norm(step, error);
     solve(&system, h * GAMMA, damping, error); /* it damps stiff modes as the method does */
     solve(&system, h * GAMMA, damping, unexplained);
     memset(unexplained, 0, N_JOINTS * sizeof *unexplained);
-    const double other = error_norm(step, unexplained);
-    return fmax(error_norm(step, error), other * sqrt(other)); /* it falls with h², the error with h³ */
+    const double other = error_norm(step, unexplained); /* it falls with h², the error with h³ */
+    const double norm = larger(error_norm(step, error), other * sqrt(other));
+    return modes ? larger(norm, unseen(step, modes, k) / SHARE_UNSEEN) : norm;
 }
 
 /* The rate of damping, 1/s, if a step of Dormand–Prince failed because of it, and this method is cheaper at the largest

@@ -21,10 +21,11 @@ from struct import Struct
 import numpy as np
 
 from . import event_search as events
+from .damping import Modes, find_modes
 from .dormand_prince import HEUN, Array, P, State, dormand_prince, error_norm, heun, interpolant, shared_tolerance
 from .equations import Equations
 from .pseudo_inverse import rank_margin
-from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock
+from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock, unseen
 from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
@@ -133,13 +134,16 @@ class Motion:
 
     def rates(self, y: State) -> State:
         """Return ẏ at a stage of a step; NaN if the equations have no solution there."""
-        try:
-            a, grips, margin = self.acceleration(y)
-        except np.linalg.LinAlgError:
-            a, grips, margin = [nan] * self.n, [nan] * len(self.grips[0]), nan
+        a, grips, margin = self._at_stage(y)
         self.grips.append(grips)
         self.margins.append(margin)
         return y[self.n :] + a
+
+    def _at_stage(self, y: State) -> tuple[list[float], list[float], float]:
+        try:
+            return self.acceleration(y)
+        except np.linalg.LinAlgError:
+            return [nan] * self.n, [nan] * len(self.grips[0]), nan
 
     def tolerance(self, q: float) -> float:
         """Return the tolerance of the error test on a position."""
@@ -159,6 +163,7 @@ class Motion:
             passed, y, event = soon
             return end if passed == end - t else t + passed, y, event
         step, growth = min(self.max_step, end - t), MAX_FACTOR
+        modes, exact, fresh = None, False, False  # of the damping; whether their decay is exact in the step
         while self.evaluations <= BUDGET:
             last = t + step * (1 + 1e-9) >= end
             if last:
@@ -166,8 +171,7 @@ class Motion:
             del self.grips[1:], self.margins[1:]
             stiff = self._rate * step > STABLE
             if stiff:
-                mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
-                y_new, K, norm, inside = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances)
+                y_new, K, norm, inside = self._stiff_step(y, rates, step, modes if exact else None)
             else:
                 y_new, K = dormand_prince(self.rates, y, step, rates)
                 norm, inside = error_norm(K, y, y_new, step, self.rtol, self.atol), 0.0
@@ -187,16 +191,39 @@ class Motion:
                 t, y, rates = t + step, y_new, K[-1]
                 self.grips[0], self.margins[0] = self.grips[-1], self.margins[-1]
                 step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
-                growth = MAX_FACTOR
+                growth, exact, fresh = MAX_FACTOR, False, False
             elif self._automatic and not stiff and (rate := self._limiting_rate(y, K, step, end - t)):
                 self._rate = rate  # until the end of the communication step
+            elif stiff and not exact and found is None and self._moves_freely():
+                exact, fresh = True, fresh or modes is None
+                modes = modes or self._modes(y)
             else:
                 again = stiff and growth == 1.0  # errors of stiff modes hardly depend on the step
                 step *= MIN_FACTOR if again else max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
+                if exact and not fresh:
+                    modes, fresh = self._modes(y), True
                 if step < 10 * ulp(end):
                     raise self._too_fast(y, too_fine=True, finite=all(map(isfinite, chain(*K))))
         return t, y, events.Event()
+
+    def _stiff_step(
+        self, y: State, rates: State, step: float, modes: Modes | None
+    ) -> tuple[State, list[State], float, float]:
+        """Return the result of ``rosenbrock``."""
+        mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
+        y_new, K, norm, inside = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances, modes)
+        if modes is not None:
+            lost = unseen(lambda at: self._at_stage(at)[0], modes, y, K, y_new, step, *tolerances)
+            norm = float(np.maximum(norm, lost))  # NaN if one is NaN
+        return y_new, K, norm, inside
+
+    def _moves_freely(self) -> bool:
+        """Return whether all joints move without friction."""
+        return not self.stops.held and not any(self.stops.slip)
+
+    def _modes(self, y: State) -> Modes:
+        return find_modes(self.stops.mobility(y[: self.n]), self._damping)
 
     def _limiting_rate(self, y: State, K: list[State], step: float, left: float) -> float:
         mobility = self.stops.mobility(y[: self.n])

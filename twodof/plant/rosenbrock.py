@@ -20,16 +20,23 @@ accelerate the other modes, which Σ eᵢ uᵢ does not show. Therefore rᵢ = h
 velocities that T does not explain, must be proportional to time: rᵢ − αᵢ r_new, times the factor, has to be within the
 tolerances.
 
+With the modes of the damping, the method integrates the difference z from their decay (``damping``), which is exact if
+M and the other accelerations stay as they are: ż = f(y(t) + z) − ẏ(t), z(0) = ż(0) = 0. Long steps then pass although
+fast modes decay within them. The stages come too late to see how M⁻¹D changes during such a decay. One evaluation at
+the end of the step, with the velocities δv that have decayed, estimates that effect:
+(f(q, v + σ δq) − f(q, v) − T σ δq)/σ, with their displacement δq and σ = |δv|/|δq|.
+
 Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of index
 1", BIT 45(4), 2005, in the form without products by T of Hairer & Wanner, "Solving ODEs II", IV.7.
 """
 
 from collections.abc import Callable
-from math import sqrt
+from math import inf, sqrt
 from operator import mul
 
 import numpy as np
 
+from .damping import Modes
 from .dormand_prince import Array, State
 
 GAMMA = 0.435866521508459
@@ -49,6 +56,10 @@ STABLE, WORTH = 3.3, 12.0
 """Damping rate times step: up to STABLE, Dormand–Prince is stable; if the product with the largest step exceeds WORTH,
 this method is cheaper.
 """
+UNSEEN, SHARE_UNSEEN = 10.0, 0.2
+"""Modes decay before the stages if the cube of damping rate times step exceeds UNSEEN. Later steps do not see their
+effects either, which therefore may only have a share of the tolerances.
+"""
 
 
 def rosenbrock(
@@ -60,6 +71,7 @@ def rosenbrock(
     k1: State,
     rtol: float,
     atol: float,
+    modes: Modes | None = None,
 ) -> tuple[State, list[State], float, float]:
     """Take one step from y with the derivative k1.
 
@@ -70,6 +82,7 @@ def rosenbrock(
         y: the state (q, v).
         k1: ẏ at y.
         rtol, atol: tolerances of the state.
+        modes: the modes whose decay is exact; None for none.
 
     Returns:
         y_new; the derivatives for ``CUBIC``, the last of which is ẏ at y_new; the norm of the error, or that of the
@@ -77,40 +90,95 @@ def rosenbrock(
         modes have not decayed.
     """
     n = len(damping)
-    solve = np.linalg.inv(np.eye(n) + step * GAMMA * mobility * damping)
-    k, at, by_T, U, TU, rest = k1, y, [0.0] * n, list[State](), list[State](), list[Array]()
-    for a, c in zip((*A, ()), ((), *C)):
+    solve = np.linalg.inv(np.eye(n) + step * GAMMA * mobility * damping).astype(float)
+    base, base_rates, first_rates = [0.0] * len(y), [0.0] * len(y), [0.0] * len(y)
+    if modes is not None:
+        first_rates, v, a_modes = k1, np.array(y[n:]), modes.VM @ k1[n:]
+    z1, by_T = [rate - own for rate, own in zip(k1, first_rates)], [0.0] * n
+    U, TU, rest, change, k, k_new = list[State](), list[State](), list[Array](), y, z1, k1
+    for a, c, node in zip((*A, ()), ((), *C), (*NODES, 1.0)):
         columns = list(zip(*U)) or [()] * len(y)
         r = [GAMMA * (step * rate + sum(map(mul, c, u))) for rate, u in zip(k, columns)]
         u_v = solve.dot(r[n:]).tolist()
         U.append([p + step * GAMMA * s for p, s in zip(r, u_v)] + u_v)
         TU.append([(u - w) / (step * GAMMA) for u, w in zip(u_v, r[n:])])
         if a:
-            at = [x + sum(map(mul, a, u)) for x, u in zip(y, zip(*U))]
+            change = [sum(map(mul, a, u)) for u in zip(*U)]
             by_T = [sum(map(mul, a, u)) for u in zip(*TU)]
         else:
-            at, by_T = [x + u for x, u in zip(at, U[-1])], [x + u for x, u in zip(by_T, TU[-1])]
-        k = rates(at)
-        rest.append(step * (np.array(k[n:]) - k1[n:] - by_T))
-    y_new, k_new = at, k
-    mean = [sum(map(mul, M, u)) / step for u in zip(*U)]  # a difference of states loses digits in short steps
-    v, v_new = y[n:], y_new[n:]
-    first, last = k1[n:], k_new[n:]
+            change, by_T = [x + u for x, u in zip(change, U[-1])], [x + u for x, u in zip(by_T, TU[-1])]
+        if modes is not None:
+            base, base_rates = (part.tolist() for part in modes.decay(v, a_modes, node * step))
+        y_new = [x + (u + w) for x, u, w in zip(y, change, base)]
+        k_new = rates(y_new)
+        k = [rate - own for rate, own in zip(k_new, base_rates)]
+        rest.append(step * (np.array(k[n:]) - z1[n:] - by_T))
+    mean = [(u + w) / step for u, w in zip(change, base)]  # a difference of states loses digits in short steps
+    derivatives = _dense_output(y, y_new, step, k1, k_new, mean, (rtol, atol))
+    tolerances = atol + rtol * np.maximum(np.abs(y), np.abs(y_new))
+    norm, inside = _errors(U, rest, solve, step, tolerances)
+    return y_new, derivatives, norm, inside if modes is None else inf
+
+
+def _errors(U: list[State], rest: list[Array], solve: Array, step: float, tolerances: Array) -> tuple[float, float]:
+    """Return the two norms of ``rosenbrock``."""
+    n, errors = len(solve), np.array([sum(map(mul, E, u)) for u in zip(*U)])
+    inside = _norm(errors / tolerances)
+    errors[n:] = solve.dot(errors[n:])
+    errors[:n] += step * GAMMA * errors[n:]
+    unexplained = solve.dot(np.max([np.abs(r - node * rest[-1]) for node, r in zip(NODES, rest)], axis=0))
+    other = _norm(unexplained / tolerances[n:]) / sqrt(2.0)
+    norm = np.maximum(_norm(errors / tolerances), other * sqrt(other))  # one falls with h³, the other with h²
+    return float(norm), inside
+
+
+def unseen(
+    acceleration: Callable[[State], State],
+    modes: Modes,
+    y: State,
+    K: list[State],
+    y_new: State,
+    step: float,
+    rtol: float,
+    atol: float,
+) -> float:
+    """Return the norm, for ``rosenbrock``'s, of the velocity changes by modes that have decayed before the stages.
+
+    Args:
+        acceleration: q̈ at a state.
+        K: the derivatives of the step from y to y_new.
+    """
+    n = len(modes.rate)
+    q, v, v_new = y_new[:n], np.array(y[n:]), np.array(y_new[n:])
+    z = modes.rate * step
+    seen = UNSEEN / (UNSEEN + z**3)
+    lost = (1.0 - seen) * (modes.VM @ (v - v_new))
+    fast, moved = lost @ modes.V, np.divide(lost, modes.rate, out=np.zeros(n), where=seen < 1.0) @ modes.V
+    if not moved.any():
+        return 0.0
+    rate = float(np.linalg.norm(fast) / np.linalg.norm(moved))
+    a = np.array(acceleration([*q, *(v_new + rate * moved).tolist()]))
+    change = (a - K[-1][n:]) / rate + fast  # T is −rate in each mode
+    return _norm(change / (atol + rtol * np.maximum(np.abs(v), np.abs(v_new)))) / sqrt(2.0) / SHARE_UNSEEN
+
+
+def _norm(ratios: Array) -> float:
+    """Return the root mean square."""
+    return float(np.linalg.norm(ratios)) / sqrt(len(ratios))
+
+
+def _dense_output(
+    y: State, y_new: State, step: float, k1: State, k_new: State, mean: State, tolerances: tuple[float, float]
+) -> list[State]:
+    """Return the derivatives for ``CUBIC``; mean is that of ẏ over the step."""
+    n, (rtol, atol) = len(y) // 2, tolerances
+    v, v_new, first, last = y[n:], y_new[n:], k1[n:], k_new[n:]
     for i, (s, p, q) in enumerate(zip(mean, v, v_new)):
         a, b = (6.0 * s - 4.0 * p - 2.0 * q) / step, (2.0 * p + 4.0 * q - 6.0 * s) / step
         tolerance = atol + rtol * max(abs(p), abs(q))
         first[i] = first[i] if p == 0.0 or step * abs(first[i] - a) <= tolerance else a
         last[i] = last[i] if step * abs(last[i] - b) <= tolerance else b
-    errors = np.array([sum(map(mul, E, u)) for u in zip(*U)])
-    tolerances = atol + rtol * np.maximum(np.abs(y), np.abs(y_new))
-    inside = np.linalg.norm(errors / tolerances) / sqrt(len(y))
-    errors[n:] = solve.dot(errors[n:])
-    errors[:n] += step * GAMMA * errors[n:]
-    norm = np.linalg.norm(errors / tolerances) / sqrt(len(y))
-    unexplained = solve.dot(np.max([np.abs(r - node * rest[-1]) for node, r in zip(NODES, rest)], axis=0))
-    other = np.linalg.norm(unexplained / tolerances[n:]) / sqrt(len(y))
-    norm = max(norm, other * sqrt(other))  # it falls with h², the error with h³
-    return y_new, [k1, v + first, mean, v_new + last, k_new], float(norm), float(inside)
+    return [k1, v + first, mean, v_new + last, k_new]
 
 
 def limiting_rate(mobility: Array, damping: Array, K: list[State], step: float, largest: float) -> float:

@@ -1,0 +1,51 @@
+"""The exact solution of the damped motion M v̇ = −D v, with M as at one position.
+
+With V M Vᵀ = 1 and V D Vᵀ = diag(s), the velocity c in each mode, one row of V, decays on its own:
+
+    ċ = −s c        c = V M v        v = Vᵀ c
+
+An acceleration a at first, in the modes, and no change of v̇ but that of the damping, give
+
+    v(t) = v + Vᵀ t φ₁(s t) a        φ₁(z) = (1 − exp(−z))/z
+    q(t) = q + t v + Vᵀ t² φ₂(s t) a        φ₂(z) = (1 − φ₁(z))/z
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .dormand_prince import Array
+
+SERIES = 1e-3
+"""Below it, the series of φ₂ is more precise than the difference."""
+
+
+class Modes(NamedTuple):
+    """Modes of the damped motion, one a row: rates s, n values, 1/s; V and V M, n × n."""
+
+    rate: Array
+    V: Array
+    VM: Array
+
+    def decay(self, v: Array, a: Array, t: float) -> tuple[Array, Array]:
+        """Return the change of (q, v) after t, and its rate there.
+
+        Args:
+            v: velocity at first.
+            a: acceleration at first, in the modes.
+            t: time, s.
+        """
+        z, n = self.rate * t, len(v)
+        fall = np.expm1(-z)
+        first = np.divide(-fall, z, out=np.ones(n), where=z > 0.0)
+        series = 0.5 - z * (1.0 / 6 - z * (1.0 / 24 - z / 120))
+        second = np.divide(1.0 - first, z, out=series, where=z > SERIES)
+        change = np.concatenate([t * v + (t * t * second * a) @ self.V, (t * first * a) @ self.V])
+        return change, np.concatenate([v + change[n:], ((1.0 + fall) * a) @ self.V])
+
+
+def find_modes(mobility: Array, damping: Array) -> Modes:
+    """Return the modes of M⁻¹, n × n, and the damping D, n values, N·m·s/rad or N·s/m."""
+    B = np.linalg.cholesky(mobility)  # B Bᵀ = M⁻¹, so the columns of B are orthonormal by M
+    _, sigma, Vt = np.linalg.svd(np.sqrt(damping)[:, np.newaxis] * B)
+    return Modes(sigma**2, Vt @ B.T, np.linalg.solve(B.T, Vt.T).T)
