@@ -84,21 +84,47 @@ static void fill_dense_output(Step *step, const double increment[N_STATES], cons
     memcpy(step->K[N_INCREMENTS], k, sizeof step->K[N_INCREMENTS]);
 }
 
+/* The share of a mode's decay that the stages see; they come after that of a fast mode. */
+static double seen(const Modes *modes, int mode, double h)
+{
+    const double z = modes->rate[mode] * h;
+    return UNSEEN / (UNSEEN + z * z * z);
+}
+
+/* First acceleration of the exact decay, in the modes. All efforts but those of the damping are as after the decay of the
+   fast modes, because that is when the stages see them. */
+static void settled(Step *step, const Modes *modes, double a[N_JOINTS])
+{
+    double y[N_STATES], after[N_JOINTS], effort[N_JOINTS], part[N_JOINTS];
+    in_modes(modes, step->K[0] + N_JOINTS, part);
+    memcpy(y, step->y, sizeof y);
+    for (int m = 0; m < N_JOINTS; m++) {
+        const double share = seen(modes, m, step->size);
+        a[m] = (1.0 - share) * part[m];
+        for (int i = 0; i < N_JOINTS && share < 1.0; i++)
+            y[N_JOINTS + i] += modes->V[m][i] * (a[m] / modes->rate[m]);
+    }
+    evaluate(step, y, after, effort, NULL);
+    in_modes(modes, after, part);
+    for (int m = 0; m < N_JOINTS; m++)
+        a[m] += part[m];
+}
+
 /* Norm of the velocity changes that the stages do not see, because they come after a decay during which M⁻¹ D changes. k
    are the derivatives at y_new. The velocities that have decayed are `fast`, and their displacement is `moved`. */
 static double unseen(Step *step, const Modes *modes, const double k[N_STATES])
 {
-    const double h = step->size, *v = step->y + N_JOINTS, *v_new = step->y_new + N_JOINTS;
+    const double *v = step->y + N_JOINTS, *v_new = step->y_new + N_JOINTS;
     double lost[N_JOINTS], part[N_JOINTS], fast[N_JOINTS] = {0}, moved[N_JOINTS] = {0}, fast_2 = 0.0, moved_2 = 0.0;
     double y[N_STATES], a[N_JOINTS], effort[N_JOINTS], change[N_STATES] = {0};
     for (int i = 0; i < N_JOINTS; i++)
         lost[i] = v[i] - v_new[i];
     in_modes(modes, lost, part);
     for (int m = 0; m < N_JOINTS; m++) {
-        const double z = modes->rate[m] * h, seen = UNSEEN / (UNSEEN + z * z * z);
-        for (int i = 0; i < N_JOINTS && seen < 1.0; i++) {
-            fast[i] += modes->V[m][i] * ((1.0 - seen) * part[m]);
-            moved[i] += modes->V[m][i] * ((1.0 - seen) * part[m] / modes->rate[m]);
+        const double share = seen(modes, m, step->size);
+        for (int i = 0; i < N_JOINTS && share < 1.0; i++) {
+            fast[i] += modes->V[m][i] * ((1.0 - share) * part[m]);
+            moved[i] += modes->V[m][i] * ((1.0 - share) * part[m] / modes->rate[m]);
         }
     }
     for (int i = 0; i < N_JOINTS; i++) {
@@ -130,7 +156,7 @@ static double rosenbrock(Step *step, const Modes *modes)
     damped_system(step, h * GAMMA, &system);
     memcpy(k, step->K[0], sizeof k);
     if (modes) {
-        in_modes(modes, step->K[0] + N_JOINTS, a);
+        settled(step, modes, a);
         memset(k, 0, sizeof k);
         memcpy(rates_before, step->K[0], sizeof rates_before);
     }

@@ -18,6 +18,8 @@ from .dormand_prince import Array
 
 SERIES = 1e-3
 """Below it, the series of φ₂ is more precise than the difference."""
+UNSEEN = 10.0
+"""A mode decays before the stages of an integration step if the cube of rate times step exceeds it."""
 
 
 class Modes(NamedTuple):
@@ -42,6 +44,10 @@ class Modes(NamedTuple):
         second = np.divide(1.0 - first, z, out=series, where=z > SERIES)
         change = np.concatenate([t * v + (t * t * second * a) @ self.V, (t * first * a) @ self.V])
         return change, np.concatenate([v + change[n:], ((1.0 + fall) * a) @ self.V])
+
+    def seen(self, step: float) -> Array:
+        """Return the shares of the modes' decays that the stages of an integration step see."""
+        return UNSEEN / (UNSEEN + (self.rate * step) ** 3)
 
 
 def find_modes(mobility: Array, damping: Array) -> Modes:

@@ -25,7 +25,7 @@ from .damping import Modes, find_modes
 from .dormand_prince import HEUN, Array, P, State, dormand_prince, error_norm, heun, interpolant, shared_tolerance
 from .equations import Equations
 from .pseudo_inverse import rank_margin
-from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock, unseen
+from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock, settled, unseen
 from .stops import Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
@@ -194,7 +194,7 @@ class Motion:
                 growth, exact, fresh = MAX_FACTOR, False, False
             elif self._automatic and not stiff and (rate := self._limiting_rate(y, K, step, end - t)):
                 self._rate = rate  # until the end of the communication step
-            elif stiff and not exact and found is None and self._moves_freely():
+            elif stiff and not exact and found is None and self.stops.move_freely():
                 exact, fresh = True, fresh or modes is None
                 modes = modes or self._modes(y)
             else:
@@ -210,17 +210,18 @@ class Motion:
     def _stiff_step(
         self, y: State, rates: State, step: float, modes: Modes | None
     ) -> tuple[State, list[State], float, float]:
-        """Return the result of ``rosenbrock``."""
+        """Return the result of ``rosenbrock``; with modes, their decay is exact."""
         mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
-        y_new, K, norm, inside = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances, modes)
+
+        def acceleration(at: State) -> list[float]:
+            return self._at_stage(at)[0]
+
+        decay = None if modes is None else settled(acceleration, modes, y, rates, step)
+        y_new, K, norm, inside = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances, decay)
         if modes is not None:
-            lost = unseen(lambda at: self._at_stage(at)[0], modes, y, K, y_new, step, *tolerances)
+            lost = unseen(acceleration, modes, y, K, y_new, step, *tolerances)
             norm = float(np.maximum(norm, lost))  # NaN if one is NaN
         return y_new, K, norm, inside
-
-    def _moves_freely(self) -> bool:
-        """Return whether all joints move without friction."""
-        return not self.stops.held and not any(self.stops.slip)
 
     def _modes(self, y: State) -> Modes:
         return find_modes(self.stops.mobility(y[: self.n]), self._damping)

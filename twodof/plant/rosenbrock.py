@@ -22,8 +22,9 @@ tolerances.
 
 With the modes of the damping, the method integrates the difference z from their decay (``damping``), which is exact if
 M and the other accelerations stay as they are: ż = f(y(t) + z) − ẏ(t), z(0) = ż(0) = 0. Long steps then pass although
-fast modes decay within them. The stages come too late to see how M⁻¹D changes during such a decay. One evaluation at
-the end of the step, with the velocities δv that have decayed, estimates that effect:
+fast modes decay within them. The stages come after such a decay. Therefore the other accelerations are those after it
+(``settled``). The stages do not see how M⁻¹D and the other accelerations change during it. One evaluation at the end of
+the step, with the velocities δv that have decayed, estimates that effect (``unseen``):
 (f(q, v + σ δq) − f(q, v) − T σ δq)/σ, with their displacement δq and σ = |δv|/|δq|.
 
 Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of index
@@ -31,6 +32,7 @@ Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial diffe
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import inf, sqrt
 from operator import mul
 
@@ -56,10 +58,12 @@ STABLE, WORTH = 3.3, 12.0
 """Damping rate times step: up to STABLE, Dormand–Prince is stable; if the product with the largest step exceeds WORTH,
 this method is cheaper.
 """
-UNSEEN, SHARE_UNSEEN = 10.0, 0.2
-"""Modes decay before the stages if the cube of damping rate times step exceeds UNSEEN. Later steps do not see their
-effects either, which therefore may only have a share of the tolerances.
+SHARE_UNSEEN = 0.2
+"""Later steps do not see the effects of a decay before the stages either, which may have only this share of the
+tolerances.
 """
+Decay = Callable[[float], tuple[Array, Array]]
+"""Function that returns the change of (q, v) after a time, s, and its rate there."""
 
 
 def rosenbrock(
@@ -71,7 +75,7 @@ def rosenbrock(
     k1: State,
     rtol: float,
     atol: float,
-    modes: Modes | None = None,
+    decay: Decay | None = None,
 ) -> tuple[State, list[State], float, float]:
     """Take one step from y with the derivative k1.
 
@@ -82,7 +86,7 @@ def rosenbrock(
         y: the state (q, v).
         k1: ẏ at y.
         rtol, atol: tolerances of the state.
-        modes: the modes whose decay is exact; None for none.
+        decay: the exact decay of modes, with ẏ = k1 at y; None for none.
 
     Returns:
         y_new; the derivatives for ``CUBIC``, the last of which is ẏ at y_new; the norm of the error, or that of the
@@ -91,10 +95,8 @@ def rosenbrock(
     """
     n = len(damping)
     solve = np.linalg.inv(np.eye(n) + step * GAMMA * mobility * damping).astype(float)
-    base, base_rates, first_rates = [0.0] * len(y), [0.0] * len(y), [0.0] * len(y)
-    if modes is not None:
-        first_rates, v, a_modes = k1, np.array(y[n:]), modes.VM @ k1[n:]
-    z1, by_T = [rate - own for rate, own in zip(k1, first_rates)], [0.0] * n
+    base, base_rates, by_T = [0.0] * len(y), [0.0] * len(y), [0.0] * n
+    z1 = k1 if decay is None else base
     U, TU, rest, change, k, k_new = list[State](), list[State](), list[Array](), y, z1, k1
     for a, c, node in zip((*A, ()), ((), *C), (*NODES, 1.0)):
         columns = list(zip(*U)) or [()] * len(y)
@@ -107,8 +109,8 @@ def rosenbrock(
             by_T = [sum(map(mul, a, u)) for u in zip(*TU)]
         else:
             change, by_T = [x + u for x, u in zip(change, U[-1])], [x + u for x, u in zip(by_T, TU[-1])]
-        if modes is not None:
-            base, base_rates = (part.tolist() for part in modes.decay(v, a_modes, node * step))
+        if decay is not None:
+            base, base_rates = (part.tolist() for part in decay(node * step))
         y_new = [x + (u + w) for x, u, w in zip(y, change, base)]
         k_new = rates(y_new)
         k = [rate - own for rate, own in zip(k_new, base_rates)]
@@ -117,7 +119,7 @@ def rosenbrock(
     derivatives = _dense_output(y, y_new, step, k1, k_new, mean, (rtol, atol))
     tolerances = atol + rtol * np.maximum(np.abs(y), np.abs(y_new))
     norm, inside = _errors(U, rest, solve, step, tolerances)
-    return y_new, derivatives, norm, inside if modes is None else inf
+    return y_new, derivatives, norm, inside if decay is None else inf
 
 
 def _errors(U: list[State], rest: list[Array], solve: Array, step: float, tolerances: Array) -> tuple[float, float]:
@@ -130,6 +132,23 @@ def _errors(U: list[State], rest: list[Array], solve: Array, step: float, tolera
     other = _norm(unexplained / tolerances[n:]) / sqrt(2.0)
     norm = np.maximum(_norm(errors / tolerances), other * sqrt(other))  # one falls with h³, the other with h²
     return float(norm), inside
+
+
+def settled(acceleration: Callable[[State], State], modes: Modes, y: State, k1: State, step: float) -> Decay:
+    """Return the decay of the modes from y, where ẏ is k1.
+
+    All efforts but those of the damping are as after the decay of the fast modes, because that is when the stages see
+    them.
+
+    Args:
+        acceleration: q̈ at a state.
+    """
+    n = len(modes.rate)
+    share = modes.seen(step)
+    falling = (1.0 - share) * (modes.VM @ k1[n:])
+    fallen = np.divide(falling, modes.rate, out=np.zeros(n), where=share < 1.0) @ modes.V
+    v = np.array(y[n:])
+    return partial(modes.decay, v, falling + modes.VM @ acceleration([*y[:n], *(v + fallen).tolist()]))
 
 
 def unseen(
@@ -150,10 +169,9 @@ def unseen(
     """
     n = len(modes.rate)
     q, v, v_new = y_new[:n], np.array(y[n:]), np.array(y_new[n:])
-    z = modes.rate * step
-    seen = UNSEEN / (UNSEEN + z**3)
-    lost = (1.0 - seen) * (modes.VM @ (v - v_new))
-    fast, moved = lost @ modes.V, np.divide(lost, modes.rate, out=np.zeros(n), where=seen < 1.0) @ modes.V
+    share = modes.seen(step)
+    lost = (1.0 - share) * (modes.VM @ (v - v_new))
+    fast, moved = lost @ modes.V, np.divide(lost, modes.rate, out=np.zeros(n), where=share < 1.0) @ modes.V
     if not moved.any():
         return 0.0
     rate = float(np.linalg.norm(fast) / np.linalg.norm(moved))

@@ -215,6 +215,10 @@ class Stops:
         W[self.held] = 0.0
         return W
 
+    def move_freely(self) -> bool:
+        """Return whether all joints move, without friction."""
+        return not self.held and not any(self.slip)
+
     def at_limits(self, y: Sequence[float]) -> list[bool]:
         """Return for each joint whether it is at a limit, in the state (q, v)."""
         return [not low < q < high for (low, high), q in zip(self.limits, y)]
