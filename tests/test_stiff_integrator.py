@@ -32,6 +32,22 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 <limit lower="-1" upper="1" effort="0" velocity="0"/></joint></robot>"""
 
 
+SLIDES = f"""<robot name="slides"><link name="base"/>{
+    "".join(
+        f'''<link name="l{i}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial></link><joint name="j{i}" type="prismatic"><parent link="{"base" if i == 1 else f"l{i - 1}"}"/>
+<child link="l{i}"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="0" velocity="0"/></joint>'''
+        for i in (1, 2, 3)
+    )
+}</robot>"""
+"""Three slides of 1 kg in a row along x: M is constant."""
+
+
+@pytest.fixture(scope="module")
+def slides() -> Engine:
+    return Engine(from_urdf(SLIDES, "l3", "x", "effort"))
+
+
 @pytest.fixture(scope="module")
 def pendulum() -> Engine:
     return Engine(from_urdf(PENDULUM, "tip", "xz", "effort"))
@@ -191,6 +207,22 @@ def test_a_step_with_exact_decay_is_of_third_order():
         exact = solve_ivp(lambda _, y: rates(y), (0.0, h), y, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
         errors.append(np.abs(stiff_step(rates, damping, y, h)[0] - exact).max())
     assert errors[0] / errors[1] > 12 and errors[1] / errors[2] > 12, errors
+
+
+@pytest.mark.parametrize("rigid", [False, True], ids=["clamp", "rigid"])
+def test_a_joint_that_a_decay_pushes_to_its_limit_and_back_stops_there(rigid, slides):
+    """One fast mode pushes the slide out, and another one back, both within an integration step."""
+    changes = {"damping": [3274.68, 17.0457, 66057.8], "v_start": [-3.61686, 0.0, 4.03041]}
+    changes |= {"q_start": [0.0] * 3, "gravity": [0.0] * 3}
+    free = started(slides, AUTOMATIC, **changes)
+    turn = 0.0
+    for _ in range(10):
+        free.step(1e-4)
+        turn = max(turn, free.q[1])
+    assert free.q[1] < 0.0 < 1.9e-4 < turn
+    changes |= {"q_max": [1.0, 1e-4, 1.0], "rigid_stops": rigid}
+    one, other = (both(slides, started(slides, i, **changes), 1) for i in (AUTOMATIC, DORMAND_PRINCE))
+    assert one[:3] == pytest.approx(other[:3], abs=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -143,6 +143,13 @@ static void in_modes(const Modes *modes, const double v[N_JOINTS], double coordi
     }
 }
 
+/* φ₁(z) = (1 − exp(−z))/z and φ₂(z) = (1 − φ₁(z))/z. */
+static void phi(double z, double *first, double *second)
+{
+    *first = z > 0.0 ? -expm1(-z) / z : 1.0;
+    *second = z > 1e-3 ? (1.0 - *first) / z : 0.5 - z * (1.0 / 6 - z * (1.0 / 24 - z / 120));
+}
+
 /* The motion with v̇ = a at first, if only the damping changes v̇: the change of y after t, and the derivative there. a is
    in the coordinates of the modes. */
 static void decay(const Modes *modes, const double v[N_JOINTS], const double a[N_JOINTS], double t,
@@ -151,16 +158,35 @@ static void decay(const Modes *modes, const double v[N_JOINTS], const double a[N
     memset(change, 0, N_STATES * sizeof *change);
     memset(rates, 0, N_STATES * sizeof *rates);
     for (int k = 0; k < N_JOINTS; k++) {
-        const double z = modes->rate[k] * t, fall = expm1(-z), first = z > 0.0 ? -fall / z : 1.0;
-        const double second = z > 1e-3 ? (1.0 - first) / z : 0.5 - z * (1.0 / 6 - z * (1.0 / 24 - z / 120));
+        const double z = modes->rate[k] * t;
+        double first, second;
+        phi(z, &first, &second);
         for (int i = 0; i < N_JOINTS; i++) {
             change[i] += modes->V[k][i] * (t * t * second * a[k]);
             change[N_JOINTS + i] += modes->V[k][i] * (t * first * a[k]);
-            rates[N_JOINTS + i] += modes->V[k][i] * ((1.0 + fall) * a[k]);
+            rates[N_JOINTS + i] += modes->V[k][i] * ((1.0 - z * first) * a[k]);
         }
     }
     for (int i = 0; i < N_JOINTS; i++) {
         change[i] += t * v[i];
         rates[i] = v[i] + change[N_JOINTS + i];
+    }
+}
+
+/* Bounds on the distances that the joints move within t in this motion. Each mode decays, and is accelerated by the
+   efforts of other causes. a are the accelerations of the joints. */
+static void excursions(const Modes *modes, const double v[N_JOINTS], const double a[N_JOINTS], double t,
+                       double distance[N_JOINTS])
+{
+    double speed[N_JOINTS], acceleration[N_JOINTS], first, second;
+    in_modes(modes, v, speed);
+    in_modes(modes, a, acceleration);
+    memset(distance, 0, N_JOINTS * sizeof *distance);
+    for (int k = 0; k < N_JOINTS; k++) {
+        phi(modes->rate[k] * t, &first, &second);
+        const double other = acceleration[k] + modes->rate[k] * speed[k];
+        const double most = t * first * fabs(speed[k]) + t * t * second * fabs(other);
+        for (int i = 0; i < N_JOINTS; i++)
+            distance[i] += fabs(modes->V[k][i]) * most;
     }
 }

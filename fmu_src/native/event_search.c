@@ -157,6 +157,22 @@ static int may_be_arrested(const Step *step, int joint)
     return !(step->stops.slip[joint] * step->y[i] > REACH * step->size * largest);
 }
 
+/* True if no joint can reach a limit, and the rank of J⁺ cannot change, during the decay of the modes within the step: the
+   dense output does not follow it. */
+static int decays_clear(const Step *step, const Modes *modes)
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    double distance[N_JOINTS], change = 0.0;
+    excursions(modes, step->y + N_JOINTS, step->K[0] + N_JOINTS, step->size, distance);
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double q = step->y[i], reach = REACH * distance[i];
+        if (!(q - reach > low[i] && q + reach < high[i]))
+            return 0;
+        change += SWING[i] * reach;
+    }
+    return step->margin > change;
+}
+
 /* Find the positions that may pass a limit and the velocities that may pass zero within the step. Return a bound on the
    change of the singular values. */
 static double sweep(const Step *step, int near[N_STATES])

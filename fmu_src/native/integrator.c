@@ -202,13 +202,13 @@ static double until_event(Step *step, double t, double end, int hold_ends, int r
         if (limiting > 0.0) {
             *rate = limiting; /* until the end of the communication step */
         } else if (stiff && !exact && passed == 0.0 && moves_freely(step)
-                   && (modes.age != NONE || find_modes(step, &modes))) {
+                   && (modes.age != NONE || find_modes(step, &modes)) && decays_clear(step, &modes)) {
             exact = 1;
         } else {
             const int again = stiff && growth == 1.0; /* errors of stiff modes hardly depend on the step */
             next = step->size * (isfinite(norm) && !again ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
-            exact = exact && (modes.age == 0 || find_modes(step, &modes));
+            exact = exact && (modes.age == 0 || (find_modes(step, &modes) && decays_clear(step, &modes)));
             if (next < 10.0 * (nextafter(end, HUGE_VAL) - end)) {
                 failure->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
                 find_fastest(step, failure);

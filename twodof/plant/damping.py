@@ -37,17 +37,36 @@ class Modes(NamedTuple):
             a: acceleration at first, in the modes.
             t: time, s.
         """
-        z, n = self.rate * t, len(v)
-        fall = np.expm1(-z)
-        first = np.divide(-fall, z, out=np.ones(n), where=z > 0.0)
-        series = 0.5 - z * (1.0 / 6 - z * (1.0 / 24 - z / 120))
-        second = np.divide(1.0 - first, z, out=series, where=z > SERIES)
+        n, z = len(v), self.rate * t
+        first, second = _phi(z)
         change = np.concatenate([t * v + (t * t * second * a) @ self.V, (t * first * a) @ self.V])
-        return change, np.concatenate([v + change[n:], ((1.0 + fall) * a) @ self.V])
+        return change, np.concatenate([v + change[n:], ((1.0 - z * first) * a) @ self.V])
+
+    def excursions(self, v: Array, a: Array, t: float) -> Array:
+        """Return bounds on the distances that the joints move within t, n values.
+
+        Each mode decays, and is accelerated by the efforts of other causes.
+
+        Args:
+            v, a: velocities and accelerations of the joints at first.
+            t: time, s.
+        """
+        first, second = _phi(self.rate * t)
+        speed = self.VM @ v
+        most = t * first * np.abs(speed) + t * t * second * np.abs(self.VM @ a + self.rate * speed)
+        distances: Array = most @ np.abs(self.V)
+        return distances
 
     def seen(self, step: float) -> Array:
         """Return the shares of the modes' decays that the stages of an integration step see."""
         return UNSEEN / (UNSEEN + (self.rate * step) ** 3)
+
+
+def _phi(z: Array) -> tuple[Array, Array]:
+    """Return φ₁ and φ₂."""
+    first = np.divide(-np.expm1(-z), z, out=np.ones(len(z)), where=z > 0.0)
+    series = 0.5 - z * (1.0 / 6 - z * (1.0 / 24 - z / 120))
+    return first, np.divide(1.0 - first, z, out=series, where=z > SERIES)
 
 
 def find_modes(mobility: Array, damping: Array) -> Modes:

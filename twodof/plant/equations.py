@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
+from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ Response = Callable[[Array, Array, int | None, Sequence[int]], Answer]
 """The equations of motion: from (q, v), the rank of J⁺ and the directions of slip to q̈. Joints at rest are free."""
 Ratios = Callable[[Array], list[float]]
 """σ/σ_max of the task Jacobian at q, in descending order; empty for a law without J⁺."""
+NUDGE = 1e-6  # step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s
 
 
 @dataclass(frozen=True)
@@ -34,3 +37,16 @@ class Equations:
     rcond: float
     swing: Sequence[float]
     damping: Sequence[float] = ()
+
+
+def fastest_joint(acceleration: Callable[[list[float]], Sequence[float]], y: list[float]) -> tuple[int, float]:
+    """Return the joint whose acceleration is most sensitive to its own state, and its rate of change, 1/s."""
+    n, a = len(y) // 2, acceleration(y)
+    rates = []
+    for i, order in product(range(n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
+        nudged = y.copy()
+        nudged[i + n * (order == 1)] += NUDGE
+        change = abs(acceleration(nudged)[i] - a[i]) / NUDGE
+        rates.append((change ** (1 / order) if isfinite(change) else inf, i))
+    rate, joint = max(rates)
+    return joint, rate

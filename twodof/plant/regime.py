@@ -14,7 +14,7 @@ that their errors would add energy.
 """
 
 from collections.abc import Callable, Sequence
-from itertools import chain, product
+from itertools import chain
 from math import inf, isfinite, isnan, nan, ulp
 from struct import Struct
 
@@ -23,7 +23,7 @@ import numpy as np
 from . import event_search as events
 from .damping import Modes, find_modes
 from .dormand_prince import HEUN, Array, P, State, dormand_prince, error_norm, heun, interpolant, shared_tolerance
-from .equations import Equations
+from .equations import Equations, fastest_joint
 from .pseudo_inverse import rank_margin
 from .rosenbrock import CUBIC, STABLE, limiting_rate, rosenbrock, settled, unseen
 from .stops import Stops
@@ -39,7 +39,6 @@ BUDGET = 10_000_000
 """Most evaluations of the right-hand side in one communication step; only a stiff motion would need more."""
 MOST_ROWS = 6
 """Largest number of rows of a task Jacobian: three axes, and three for an orientation."""
-NUDGE = 1e-6  # step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s
 
 
 class StepError(ArithmeticError):
@@ -55,19 +54,6 @@ class StepError(ArithmeticError):
     def __init__(self, *, too_fine: bool, joint: int, rate: float, finite: bool) -> None:
         super().__init__(f"joint {joint} changes at a rate of {rate:g} 1/s")
         self.too_fine, self.joint, self.rate, self.finite = too_fine, joint, rate, finite
-
-
-def fastest_joint(acceleration: Callable[[list[float]], Sequence[float]], y: list[float]) -> tuple[int, float]:
-    """Return the joint whose acceleration is most sensitive to its own state, and its rate of change, 1/s."""
-    n, a = len(y) // 2, acceleration(y)
-    rates = []
-    for i, order in product(range(n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
-        nudged = y.copy()
-        nudged[i + n * (order == 1)] += NUDGE
-        change = abs(acceleration(nudged)[i] - a[i]) / NUDGE
-        rates.append((change ** (1 / order) if isfinite(change) else inf, i))
-    rate, joint = max(rates)
-    return joint, rate
 
 
 class Motion:
@@ -100,6 +86,8 @@ class Motion:
         self.grips: list[list[float]] = []
         self._grip_rates: dict[int, list[float]] = {}  # at the end of the last regime, per s
         self.margins: list[float] = []
+        self._modes: Modes | None = None  # of the damping, as in the state _modes_at
+        self._modes_at: State = []
 
     def set_out(self, y: State, anti_chatter: Sequence[bool], on_hold: Sequence[bool], rank_held: bool) -> State:
         """Apply an impact and determine the regime after it; return ẏ in it.
@@ -163,7 +151,7 @@ class Motion:
             passed, y, event = soon
             return end if passed == end - t else t + passed, y, event
         step, growth = min(self.max_step, end - t), MAX_FACTOR
-        modes, exact, fresh = None, False, False  # of the damping; whether their decay is exact in the step
+        self._modes, exact = None, False  # whether their decay is exact in the step
         while self.evaluations <= BUDGET:
             last = t + step * (1 + 1e-9) >= end
             if last:
@@ -171,7 +159,7 @@ class Motion:
             del self.grips[1:], self.margins[1:]
             stiff = self._rate * step > STABLE
             if stiff:
-                y_new, K, norm, inside = self._stiff_step(y, rates, step, modes if exact else None)
+                y_new, K, norm, inside = self._stiff_step(y, rates, step, self._modes if exact else None)
             else:
                 y_new, K = dormand_prince(self.rates, y, step, rates)
                 norm, inside = error_norm(K, y, y_new, step, self.rtol, self.atol), 0.0
@@ -191,18 +179,16 @@ class Motion:
                 t, y, rates = t + step, y_new, K[-1]
                 self.grips[0], self.margins[0] = self.grips[-1], self.margins[-1]
                 step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
-                growth, exact, fresh = MAX_FACTOR, False, False
+                growth, exact = MAX_FACTOR, False
             elif self._automatic and not stiff and (rate := self._limiting_rate(y, K, step, end - t)):
                 self._rate = rate  # until the end of the communication step
-            elif stiff and not exact and found is None and self.stops.move_freely():
-                exact, fresh = True, fresh or modes is None
-                modes = modes or self._modes(y)
+            elif stiff and not exact and found is None and self._decays_clear(y, rates, step):
+                exact = True
             else:
+                exact = exact and (self._modes_at is y or self._decays_clear(y, rates, step, anew=True))
                 again = stiff and growth == 1.0  # errors of stiff modes hardly depend on the step
                 step *= MIN_FACTOR if again else max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
-                if exact and not fresh:
-                    modes, fresh = self._modes(y), True
                 if step < 10 * ulp(end):
                     raise self._too_fast(y, too_fine=True, finite=all(map(isfinite, chain(*K))))
         return t, y, events.Event()
@@ -223,8 +209,19 @@ class Motion:
             norm = float(np.maximum(norm, lost))  # NaN if one is NaN
         return y_new, K, norm, inside
 
-    def _modes(self, y: State) -> Modes:
-        return find_modes(self.stops.mobility(y[: self.n]), self._damping)
+    def _decays_clear(self, y: State, rates: State, step: float, *, anew: bool = False) -> bool:
+        """Return whether all joints move freely, and meet no event during the decay of the modes within a step.
+
+        The modes are found if there are none, or anew.
+        """
+        if not self.stops.move_freely():
+            return False
+        if self._modes is None or anew:
+            self._modes, self._modes_at = find_modes(self.stops.mobility(y[: self.n]), self._damping), y
+        v, a = np.array(y[self.n :]), np.array(rates[self.n :])
+        reach = (events.REACH * self._modes.excursions(v, a, step)).tolist()
+        free = all(low < q - r and q + r < high for q, r, (low, high) in zip(y, reach, self.stops.limits))
+        return free and self.margins[0] > sum(map(float.__mul__, self._equations.swing, reach))
 
     def _limiting_rate(self, y: State, K: list[State], step: float, left: float) -> float:
         mobility = self.stops.mobility(y[: self.n])
