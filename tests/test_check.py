@@ -117,6 +117,7 @@ FAULTS = {
 }
 ALSO = {
     "SHARES": ("state", "serialised state"),
+    "SHARES_PARAMETER": ("serialised state",),
     "RESTORES_NOTHING": ("serialised state",),
     "RESTORES_NO_INPUT": ("serialised state",),
     "LOSES_TUNABLE": ("serialised state",),
@@ -124,6 +125,14 @@ ALSO = {
     "CRASHES": ("serialised state",),
     "COUNTS": ("simulation", "two instances", "state", "serialised state", "derivatives"),
 }
+OF_ZEROS = {
+    "NONE": ({}, {}),
+    "KEEPS_ZERO": ({"reset": "w is 0.0001 after a reset, and its start value is 0.0"}, {}),
+    "SHARES_ZERO": ({"two instances": "beside a second", "serialised state": "at the restored"}, {}),
+    "LOSES_ZERO": ({"serialised state": "at the restored state: y is"}, {"state": "at the restored state: y is"}),
+}
+ZEROS = """<Real name="w" valueReference="14" causality="parameter" variability="fixed" start="0"/>
+<Real name="s" valueReference="15" causality="parameter" variability="fixed" min="0" start="0"/></ModelVariables>"""
 OF_OTHER_KINDS = "KEEPS_INTEGER", "KEEPS_BOOLEAN", "LOSES_TUNABLE", "LOSES_INTEGER"
 OF_MORE_TYPES = {
     "NONE": (set(), ""),
@@ -397,6 +406,35 @@ def test_integers_and_truth_values_have_their_start_values(tmp_path: Path) -> No
         (tmp_path / "pd.fmu").write_bytes(pd_fmu(replaced=changed))
         found = failed(twodof.check(tmp_path / "pd.fmu"))
         assert ("start values" in found) == bool(changed)
+
+
+def with_zeros(description: str, variability: str) -> str:
+    """Return a description with parameters that start at 0."""
+    zeros = ZEROS.replace('"fixed"', f'"{variability}"', 1)
+    if 'fmiVersion="3.0"' in description:
+        zeros = zeros.replace("Real", "Float64")
+    else:
+        zeros = re.sub("<Real (.*?)((?: min.*)? start.*)/>", r"<ScalarVariable \1><Real\2/></ScalarVariable>", zeros)
+    return description.replace("</ModelVariables>", zeros)
+
+
+@pytest.mark.parametrize("description", [DESCRIPTION, DESCRIPTION_3], ids="23")
+@pytest.mark.parametrize("variability", ["fixed", "tunable"])
+@pytest.mark.parametrize("fault", OF_ZEROS)
+def test_parameters_that_start_at_0_are_changed(fault: str, variability: str, description: str, tmp_path: Path) -> None:
+    """The FMU refuses one of them, and allows no further call then."""
+    found = failed(twodof.check(foreign(tmp_path, fault, with_zeros(description, variability))))
+    texts, tunable = OF_ZEROS[fault]
+    expected = {**texts, **tunable} if variability == "tunable" else texts
+    assert {*found} == {*expected} and all(found[row].startswith(text) for row, text in expected.items()), found
+
+
+def test_a_crash_after_a_change_of_a_parameter_from_0_is_a_remark(tmp_path: Path) -> None:
+    """A parameter of 0 can be a switch."""
+    check = twodof.check(foreign(tmp_path, "SWITCH_ABORTS", with_zeros(DESCRIPTION, "fixed")))
+    rows = {row.name: row for row in check.rows if "changed from 0" in row.text}
+    assert {*rows} == {"reset", "two instances", *STATES} and {row.outcome for row in rows.values()} == {"remark"}
+    assert check.passed and "changed from 0, step 1: Aborted" in rows["reset"].text, check
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])

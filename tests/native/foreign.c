@@ -13,15 +13,16 @@ enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES,
        KEEPS_INTEGER, KEEPS_BOOLEAN, LOSES_TUNABLE, LOSES_INTEGER, FLUSHES,
        DESTROYS, READS_STEER, NOT_EXACT, NOT_CONSTANT, WRONG_TIME, KEEPS_HANDLE, LEAVES_POINTER,
        ONE_STATE, NOT_FINITE_AT_START, SMALL_SLOPE, WRONG_TEXT, WRONG_ITEM, KEEPS_TEXT, LOSES_ITEM, READS_TWO,
-       DERIVATIVES_STEER, ROUNDS, STRICT };
+       DERIVATIVES_STEER, ROUNDS, STRICT,
+       KEEPS_ZERO, SHARES_ZERO, LOSES_ZERO, SWITCH_ABORTS };
 #ifndef X
 #define X 1.0
 #endif
-typedef struct { double u, x, p; int phase; double t; int k, b, reads, item; char text[16]; } M;
+typedef struct { double u, x, p; int phase; double t; int k, b, reads, item; char text[16]; double w, s; } M;
 static M one;
 static double shared;
 static int count, living;
-static double shared_p, flushed;
+static double shared_p, shared_w, flushed;
 static char names[8][80];
 static M *owners[8];
 static void start(M *m) {
@@ -31,7 +32,7 @@ static void start(M *m) {
 static double y_of(M *m) {
     return (FAULT == SHARES ? shared : m->x) + (FAULT == OLD_SLOPE ? 2.0 + 10.0 * m->t : 2.0) * m->u
         + (FAULT == HIGH ? 1e6 : 0.0) + (FAULT == SHARES_PARAMETER ? shared_p : FAULT == LOSES_TUNABLE ? m->p : 0.0)
-        + (FAULT == LOSES_INTEGER ? m->k : FAULT == LOSES_ITEM ? m->item : 0);
+        + (FAULT == SHARES_ZERO ? shared_w : m->w) + (FAULT == LOSES_INTEGER ? m->k : FAULT == LOSES_ITEM ? m->item : 0);
 }
 
 fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
@@ -55,12 +56,14 @@ void fmi2FreeInstance(fmi2Component c) {
 }
 fmi2Status fmi2Reset(fmi2Component c) {
     M old = *(M *)c;
+    if (old.phase == 9) abort();  /* a fatal failure allows no further call */
     if (FAULT == HANGS) for (;;) sleep(1);
     if (FAULT == GREEDY && fopen("litter", "w") && !malloc((size_t)5 << 30)) abort();
     start(c);
     if (FAULT == KEEPS) ((M *)c)->x = old.x;
     if (FAULT == KEEPS_INPUT) ((M *)c)->u = old.u;
     if (FAULT == KEEPS_PARAMETER) ((M *)c)->p = old.p;
+    if (FAULT == KEEPS_ZERO) ((M *)c)->w = old.w;
     if (FAULT == KEEPS_INTEGER) ((M *)c)->k = old.k;
     if (FAULT == KEEPS_BOOLEAN) ((M *)c)->b = old.b;
     if (FAULT == KEEPS_TEXT) memcpy(((M *)c)->text, old.text, sizeof old.text);
@@ -70,6 +73,7 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return ((M *)c)->phase
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     shared = ((M *)c)->x;
     shared_p = ((M *)c)->p;
+    shared_w = ((M *)c)->w;
     ((M *)c)->phase = 1;
     return fmi2OK;
 }
@@ -78,7 +82,10 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
     M *m = c;
     for (size_t i = 0; i < n; i++)
         if (FAULT == BOUNDED && r[i] == 1 && v[i] > 0.0) return fmi2Error;
-    for (size_t i = 0; i < n; i++) *(r[i] == 1 ? &m->u : r[i] == 2 ? &m->x : &m->p) = v[i];
+    for (size_t i = 0; i < n; i++) {
+        *(r[i] == 1 ? &m->u : r[i] == 2 ? &m->x : r[i] == 14 ? &m->w : r[i] == 15 ? &m->s : &m->p) = v[i];
+        if (r[i] == 15 && v[i] != 0.0 && FAULT != SWITCH_ABORTS) { m->phase = 9; return fmi2Fatal; }
+    }
     return fmi2OK;
 }
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, fmi2Real v[]) {
@@ -89,6 +96,10 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
                           defined ? y_of(m) : NAN, m->p, 0.0, 0.0,
                           FAULT == ROUNDS ? (1e-3 * m->u + 3e5) - 3e5 : 1e-8 * m->u,
                           FAULT == WRONG_TIME ? 1.01 * m->t : m->t, FAULT == NOT_CONSTANT ? 9.8 : 9.81};
+        if (r[i] == 14 || r[i] == 15) {
+            v[i] = r[i] == 14 ? m->w : m->s;
+            continue;
+        }
         if (r[i] > 10 && FAULT == FRAGILE) abort();
         if (r[i] > 10) return fmi2Error;
         m->reads++;
@@ -100,6 +111,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
     M *m = c;
     if (m->phase != 1) return fmi2Error;
+    if (m->s != 0.0) abort();
     if (FAULT == DISCARDS && t > 0.05) return fmi2Discard;
     if (FAULT == DISCARDS_LARGE && h > 0.015) return fmi2Discard;
     if (FAULT == ENDS && t + h > 0.1 + 1e-9) return fmi2Discard;
@@ -119,12 +131,13 @@ fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) {
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
     if (FAULT == CRASHES) abort();
     if (FAULT == FLUSHES && ((M *)s)->t < flushed) return fmi2Error;
-    double u = ((M *)c)->u, p = ((M *)c)->p;
+    double u = ((M *)c)->u, p = ((M *)c)->p, w = ((M *)c)->w;
     int k = ((M *)c)->k, item = ((M *)c)->item;
     if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;
     if (FAULT == DESTROYS) ((M *)s)->x = 0.0;
     if (FAULT == RESTORES_NO_INPUT) ((M *)c)->u = u;
     if (FAULT == LOSES_TUNABLE) ((M *)c)->p = p;
+    if (FAULT == LOSES_ZERO) ((M *)c)->w = w;
     if (FAULT == LOSES_INTEGER) ((M *)c)->k = k;
     if (FAULT == LOSES_ITEM) ((M *)c)->item = item;
     return fmi2OK;

@@ -24,7 +24,7 @@ from .importers import require
 from .reference_runs import Reference, references_of
 from .ssp_file import STRUCTURE, read_ssp
 from .system import load_system
-from .trial import Trial, UnpassedError
+from .trial import UNUSUAL, Trial, UnpassedError
 from .trials import FORBIDDEN, TRIALS, reference_run
 
 MOST_PROBLEMS = 20  # of a description, in its row
@@ -188,7 +188,7 @@ def _tried(fmu: Fmu, tasks: Sequence[_Task]) -> Iterator[Row]:
                     what = f"the process that checks it did not start within {MAX_START_WAIT} s: {end}"
                     raise ChildError(f"'{fmu.path}': {what}; repeat the check when this machine is less busy") from end
                 limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
-                outcome = "remark" if doing.startswith(FORBIDDEN) else "failed"
+                outcome = "remark" if doing.startswith((FORBIDDEN, UNUSUAL)) else "failed"
                 yield Row(waiting.pop(0).name, outcome, f"it ended its process at: {doing}{limit}: {end}")
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cached_property
 from math import inf, isfinite
 from typing import Any
 
@@ -19,7 +20,10 @@ from .system_instance import instantiate_fmu
 
 STEPS = 20
 DELTA = 1e-4  # change of a variable, relative to its magnitude or to 1
+MOST_TRIES = 100  # runs that find out which values an FMU accepts
+UNUSUAL = "a run with parameters changed from 0"
 Outputs = tuple[Any, ...]
+Values = dict[str, float | bool]
 
 
 class UnpassedError(Exception):
@@ -37,6 +41,7 @@ class Trial:
         note: called with the name of the next call, which the report of a crash contains.
 
     Attributes:
+        during: what the next calls belong to, with a comma; "" for the trial itself.
         start, step: start time and step of its default experiment, s.
         steps: number of steps of a run, which ends at the stop time of the default experiment at the latest.
         variables: FMPy's descriptions of real variables, by the names of their elements.
@@ -52,7 +57,8 @@ class Trial:
     """
 
     def __init__(self, fmu: Fmu, note: Callable[[str], object]) -> None:
-        self.fmu, self.note, self.about = fmu, note, fmu.description
+        self.fmu, self._note, self.about = fmu, note, fmu.description
+        self.during = ""
         start, stop, step = (
             getattr(self.about.defaultExperiment, name, None) for name in ("startTime", "stopTime", "stepSize")
         )
@@ -84,11 +90,11 @@ class Trial:
         """Return values of the inputs that differ from their start values, so that an FMU at rest moves."""
         return {name: self.inside(name, DELTA) for name in [*self.inputs, *self.held]}
 
-    def changed_parameters(self) -> dict[str, float]:
-        """Return values of parameters that differ from their start values; a parameter of 0 is often a switch."""
-        numbers = {name: start for name, start in self.starts.items() if start and isfinite(start)}
+    def changed_parameters(self, *, zero: bool = False) -> dict[str, float]:
+        """Return values of parameters that differ from their start values, which are 0 or not."""
+        numbers = {n: start for n, start in self.starts.items() if isfinite(start) and (start == 0.0) == zero}
         return {
-            name: self.inside(name, DELTA * abs(start))
+            name: self.inside(name, DELTA * (abs(start) or 1.0))
             for name, start in numbers.items()
             if self.variables[name].causality == "parameter" and self.variables[name].variability != "constant"
         }
@@ -107,6 +113,48 @@ class Trial:
             if allowed:
                 values[name] = allowed[0]
         return values
+
+    @cached_property
+    def other_values(self) -> Values:
+        """Other values of inputs, discrete variables, and parameters not 0 at the start, that the FMU accepts."""
+        with self.instance() as instance:
+            self.rows(instance)
+        return self._accepted({}, [self.changed_inputs(), self.changed_parameters(), self.changed_discrete()])
+
+    @cached_property
+    def _all_values(self) -> Values:
+        self.during = f"{UNUSUAL}, "
+        try:
+            return self._accepted(self.other_values, [self.changed_parameters(zero=True)])
+        finally:
+            self.during = ""
+
+    def rounds(self) -> Iterator[Values]:
+        """Yield other values, first without parameters that start at 0; many of these are switches."""
+        yield self.other_values
+        if self._all_values != self.other_values:
+            yield self._all_values
+
+    def _accepted(self, values: Values, groups: Sequence[Mapping[str, float | bool]]) -> Values:
+        """Return values and those of groups with which the FMU runs; halves of a group that it refuses are tried."""
+        values, waiting = {**values}, [group for group in reversed(groups) if group]
+        for _ in range(MOST_TRIES):
+            if not waiting:
+                break
+            group = waiting.pop()
+            with suppress(SimulationError), self.instance({**values, **group}) as instance:
+                self.rows(instance)
+                values |= group
+                continue
+            names = [*group]
+            if len(names) > 1:
+                half = len(names) // 2
+                waiting += [{n: group[n] for n in part} for part in (names[half:], names[:half])]
+        return values
+
+    def note(self, what: str) -> None:
+        """Report the name of the next call."""
+        self._note(f"{self.during}{what}")
 
     def require(self, *claims: str) -> None:
         """End a trial of a feature that the description does not claim."""

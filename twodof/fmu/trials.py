@@ -22,14 +22,13 @@ from .importers import READ_AT_START, TOOLS, Run, in_this_master
 from .instance import Instance
 from .reference_runs import Reference
 from .system_instance import instantiate_fmu
-from .trial import Outputs, Trial, UnpassedError
+from .trial import Outputs, Trial, UnpassedError, Values
 
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 """Sizes of variable steps, as multiples of the default step."""
 FORBIDDEN = "a forbidden call"
 UNKNOWN = 2**31 - 9  # a value reference that no variable has
 Calls = dict[str, tuple[str, Callable[[Instance], object]]]
-Values = dict[str, float | bool]
 
 
 def simulation(trial: Trial) -> str:
@@ -71,11 +70,17 @@ def _compare_starts(trial: Trial, instance: Instance, starts: Mapping[str, float
 def reset(trial: Trial) -> str:
     """Run, run with other inputs and parameters, reset and run again."""
     trial.require_outputs()
+    for values in trial.rounds():
+        _reset_after(trial, values)
+    return "the run after a reset, and after a run with other values, is equal"
+
+
+def _reset_after(trial: Trial, values: Values) -> None:
     with trial.instance() as instance:
         before = dict(zip(trial.starts, instance.reader([*trial.starts])()))
         once = trial.rows(instance)
         with suppress(SimulationError):
-            trial.begin_again(instance, _other_values(trial, instance))
+            trial.begin_again(instance, values)
             trial.rows(instance)
         for name, start in trial.discrete_starts.items():
             if isinstance(start, str):  # a run might open a file of this name
@@ -85,7 +90,6 @@ def reset(trial: Trial) -> str:
         trial.begin_again(instance)
         _compare_starts(trial, instance, {**before, **trial.discrete_starts}, "after a reset")
         trial.compare(once, trial.rows(instance), "after a reset")
-    return "the run after a reset, and after a run with other values, is equal"
 
 
 def two_instances(trial: Trial) -> str:
@@ -93,8 +97,14 @@ def two_instances(trial: Trial) -> str:
     if trial.about.coSimulation.canBeInstantiatedOnlyOncePerProcess:
         raise UnpassedError("does not apply", "it states canBeInstantiatedOnlyOncePerProcess")
     trial.require_outputs()
+    for values in trial.rounds():
+        _step_in_turn(trial, {}, values)
+    return "two instances, stepped in turn, are equal to one alone"
+
+
+def _step_in_turn(trial: Trial, *given: Values) -> None:
+    """Compare instances with given values, stepped in turn, with runs of one alone."""
     with trial.instance() as first:
-        given: tuple[Values, ...] = {}, _other_values(trial, first)
 
         def begun(values: Values) -> Instance:
             instance = first.another()
@@ -113,47 +123,31 @@ def two_instances(trial: Trial) -> str:
                 trial.compare(rows[k + min(k, 1) : k + 2], trial.rows(instance, 1, k), "beside a second instance")
         for instance in pair:
             instance.free()
-    return "two instances, stepped in turn, are equal to one alone"
-
-
-def _other_values(trial: Trial, instance: Instance) -> Values:
-    """Return other values of inputs, real parameters and discrete variables, except kinds that the FMU refuses."""
-    values: Values = {}
-    for change in (trial.changed_inputs(), trial.changed_parameters(), trial.changed_discrete()):
-        with suppress(SimulationError):
-            trial.begin_again(instance, {**values, **change})
-            trial.rows(instance)
-            values |= change
-    return values
-
-
-def _changing_values(trial: Trial) -> Values:
-    """Return other values of inputs and parameters that may change between steps."""
-    if {*trial.inputs} >= trial.changing:
-        return {**trial.changed_inputs()}
-    with trial.instance() as instance:
-        return {name: value for name, value in _other_values(trial, instance).items() if name in trial.changing}
 
 
 def state(trial: Trial) -> str:
     """Save the state, step, restore it and step again."""
     trial.require("canGetAndSetFMUstate")
-    values, starts = _changing_values(trial), {**trial.starts, **trial.discrete_starts}
-    with trial.instance(values) as instance:
-        saved, rows = _saved(trial, instance)
-        instance.set({name: starts[name] for name in values if name in starts})
-        return _restored(trial, instance, saved, rows)
+    starts = {**trial.starts, **trial.discrete_starts}
+    for values in trial.rounds():
+        with trial.instance(values) as instance:
+            saved, rows = _saved(trial, instance)
+            instance.set({name: starts[name] for name in values if name in trial.changing})
+            text = _restored(trial, instance, saved, rows)
+    return text
 
 
 def serialised_state(trial: Trial) -> str:
     """Restore a serialised state in a new instance, after the old one and its state were freed."""
     trial.require("canGetAndSetFMUstate", "canSerializeFMUstate")
-    with trial.instance(_changing_values(trial)) as instance:
-        saved, rows = _saved(trial, instance)
-        content = bytes(instance.slave.serializeFMUState(saved))
-        instance.slave.freeFMUState(saved)
-    with trial.instance() as instance:
-        return _restored(trial, instance, instance.slave.deserializeFMUState(content), rows) + " in a new instance"
+    for values in trial.rounds():
+        with trial.instance(values) as instance:
+            saved, rows = _saved(trial, instance)
+            content = bytes(instance.slave.serializeFMUState(saved))
+            instance.slave.freeFMUState(saved)
+        with trial.instance() as instance:
+            text = _restored(trial, instance, instance.slave.deserializeFMUState(content), rows)
+    return f"{text} in a new instance"
 
 
 def _saved(trial: Trial, instance: Instance) -> tuple[c_void_p, list[Outputs]]:
@@ -228,11 +222,8 @@ def variable_steps(trial: Trial) -> str:
 
 def inputs(trial: Trial) -> str:
     """Change each input at the start and between steps; compare changed outputs with stated dependencies."""
-    changes: Values = {**trial.changed_inputs()}
-    if any(trial.fmu.variables[name].causality == "input" for name in trial.changed_discrete()):
-        with trial.instance() as instance:
-            others = _other_values(trial, instance)
-        changes |= {name: value for name, value in others.items() if trial.fmu.variables[name].causality == "input"}
+    others = {n: value for n, value in trial.other_values.items() if trial.fmu.variables[n].causality == "input"}
+    changes: Values = {**trial.changed_inputs(), **others}
     if not changes:
         raise UnpassedError("does not apply", "it has no inputs that can be changed")
     initial, later = _stated(trial.about.initialUnknowns), _stated(trial.about.outputs)
