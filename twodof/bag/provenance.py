@@ -15,6 +15,7 @@ from ..files import NUMBER, VALUES, JsonObject, fits, parsed, read_file
 from ..fmu import System
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Changes, Value
+from ..simulation.setup import controller_of
 from ..version import versions
 from .mcap import read_metadata
 from .records import DamageError
@@ -52,7 +53,7 @@ class Provenance(TypedDict, total=False):
     """Content of run.json; empty for a third-party bag.
 
     ``texts`` has start values of variables of type String, ``signals`` the names of the recorded signals, and
-    ``system`` the FMUs of a system and their connections.
+    ``system`` the FMUs of a system and their connections, and ``controller`` the name of its robot's controller.
     ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` has pairs of a time and facts of a
     third party. ``verdict`` is missing if the writer died.
     """
@@ -73,6 +74,7 @@ class Provenance(TypedDict, total=False):
     urdf: str | None
     signals: list[str]
     system: dict[str, object]
+    controller: str
     input_changes: list[list[Any]]
     inputs_known_until: float
     commanders: list[object]
@@ -174,7 +176,7 @@ def provenance_of(run: Experiment, command_line: str) -> Provenance:
 
 def _system(system: System) -> Provenance:
     fmus = {name: {"name": fmu.name, "guid": fmu.guid} for name, fmu in system.components.items()}
-    return {"system": {"components": fmus, "connections": system.connections}}
+    return {"system": {"components": fmus, "connections": system.connections}, "controller": controller_of(system)}
 
 
 def file_of(namespace: str) -> str:
@@ -252,7 +254,8 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
             return {}
         content = parsed(text)
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
-            if not fits(content, SHAPE) or not fits(content.get(KNOWN_UNTIL, 0.0), NUMBER):
+            optional = (KNOWN_UNTIL, 0.0, NUMBER), ("controller", "", str)
+            if not fits(content, SHAPE) or not all(fits(content.get(key, none), of) for key, none, of in optional):
                 raise ValueError("it is damaged")
             if len(content["start_values"]) > MAX_VARIABLES:
                 raise ValueError(f"it has more than {MAX_VARIABLES} start values")

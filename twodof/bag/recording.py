@@ -258,7 +258,10 @@ class Recording:
         if self.measured:  # a measured velocity of 0 does not show that friction holds the joint
             starts = {name: value for name, value in starts.items() if not name.startswith("friction[")}
         step = self.provenance.get("step") or self.t[-1] / max(1, len(self.t) - 1)
-        return setup_of(joints=self.joints, robot=robot, frame=frame, axes=axes, step=step, starts=starts)
+        controller = self.provenance.get("controller", "")
+        return setup_of(
+            joints=self.joints, robot=robot, frame=frame, axes=axes, step=step, starts=starts, controller=controller
+        )
 
     @property
     def stored_verdict(self) -> Verdict | None:

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..geometry.dynamics import Dynamics, rotation_error
 from ..plant.variables import EXACT
-from .controller_causes import PERIODS, controller_prefix, payloads
+from .controller_causes import PERIODS, payloads
 from .judge import AT_LIMIT, Judge
 from .setup import Array
 
@@ -100,7 +100,7 @@ def parts_of_error(judge: Judge, missed: Sequence[str]) -> Parts:
 
 def _models(judge: Judge) -> dict[str, Dynamics]:
     """Return the plant's model under "", and models with one more of the controller's parameters each."""
-    own = controller_prefix(judge)
+    own = judge.setup.controller
     payload, believed = payloads(judge)
     values: dict[str, Any] = {name: judge.given(name) for name in ("gravity", "payload_com", "armature")}
     values["payload"] = payload

@@ -81,7 +81,7 @@ def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
         slight: torque, relative to the largest effort, below which a load does not count.
     """
     switch, (payload, believed) = "payload_known", payloads(judge)
-    own = controller_prefix(judge)
+    own = judge.setup.controller
     if payload and believed != payload and (share := _share(judge, payload * GRAVITY * LEVER)) > slight:
         remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
         text = f"the controller does not know the payload of {payload:g} kg; {remedy}"
@@ -133,14 +133,8 @@ def _torques(judge: Judge, values: Array) -> str:
 
 def payloads(judge: Judge) -> tuple[float, float]:
     """Return the payload of the plant and that of the controller's model, kg."""
-    believed = judge.held.get(f"{controller_prefix(judge)}payload", 0.0) if judge.held.get("payload_known") else 0.0
+    believed = judge.held.get(f"{judge.setup.controller}payload", 0.0) if judge.held.get("payload_known") else 0.0
     return float(judge.held.get("payload") or 0.0), float(believed)
-
-
-def controller_prefix(judge: Judge) -> str:
-    """Return the prefix of the controller's variables in a system, or ""."""
-    switch = "payload_known"
-    return next((name for name in judge.setup.starts if name.endswith(f".{switch}")), switch).removesuffix(switch)
 
 
 def _share(judge: Judge, torque: float) -> float:
@@ -165,7 +159,7 @@ def sampled(judge: Judge) -> Iterator[Cause]:
     """Yield sampled loops that are unstable, or else a joint that reverses as fast as the steps."""
     v, setup = judge.tail("v")[-256:], judge.setup
     sampling = [setup.starts.get(name, 0.0) for name in PERIODS]
-    if controller_prefix(judge):  # the controller is a component, and acts at communication points
+    if judge.setup.controller:  # the controller is a component, and acts at communication points
         sampling[0] = max(sampling[0], setup.step)
     continuous = bool(judge.aims) and not any(sampling) and not judge.moving and judge.given("Kp").size > 0
     if len(v) < 16 or continuous:  # communication steps have no effect on a continuous law

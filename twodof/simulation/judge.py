@@ -93,7 +93,7 @@ class Judge:
 
     def note(self, t: float, inputs: Mapping[str, float]) -> None:
         """Store the inputs that changed at a time, s; ``latest`` becomes the changes of those that are not targets."""
-        changed = {}
+        changed, inputs = {}, {self.setup.own.get(name, name): value for name, value in inputs.items()}
         for name in (name for name in inputs if name not in self._where):
             before = self.inputs.get(name, self.setup.starts.get(name, inputs[name]))
             if before != inputs[name]:

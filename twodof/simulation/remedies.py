@@ -9,7 +9,7 @@ import numpy as np
 from ..plant.urdf import UNBOUNDED
 from ..plant.variables import ROWS
 from .cause import Cause, point_text
-from .controller_causes import GAINS, controller_prefix, payloads
+from .controller_causes import GAINS, payloads
 from .judge import Judge
 from .setup import OF_THE_CONTROLLER, Array
 
@@ -17,7 +17,7 @@ LONGER = 10.0  # largest additional duration of a repeated run, as a multiple of
 TURN = 6.0  # rad: if one joint target is in degrees, larger ones and whole numbers are too
 STIFFER = 10.0  # factor of Kp in a run that tries the advice to raise it; divisor for the advice to lower it
 USUAL = {name: start for name, *_, start, _ in ROWS if isinstance(start, float)}
-SAMPLING = sorted({*OF_THE_CONTROLLER} - {"payload_known", "seed"})
+SAMPLING = sorted({*OF_THE_CONTROLLER} - {"seed"})
 
 
 class Repetition(NamedTuple):
@@ -33,6 +33,11 @@ class Repetition(NamedTuple):
     settings: tuple[tuple[str, float], ...] = ()
     longer: float = 0.0
 
+    def of(self, own: Mapping[str, str]) -> "Repetition":
+        """Return the repetition with other names of settings, which ``own`` has by full name."""
+        full = {short: name for name, short in own.items()}
+        return self._replace(settings=tuple((full.get(name, name), value) for name, value in self.settings))
+
 
 def named(values: Mapping[str, Array]) -> str:
     """Return vectors with their names in words."""
@@ -42,7 +47,7 @@ def named(values: Mapping[str, Array]) -> str:
 
 def without(judge: Judge, cause: Cause) -> Repetition | None:
     """Return the repetition of a run without one of its causes; None if the cause is not one of the settings."""
-    held, own = judge.held, controller_prefix(judge)
+    held, own = judge.held, judge.setup.controller
 
     def plan(words: str, settings: Mapping[str, float]) -> Repetition | None:
         starts, inputs = judge.setup.starts, judge.inputs
@@ -86,7 +91,7 @@ def _elements(held: Mapping[str, float], group: str, value: float) -> dict[str, 
 
 def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
     """Return the change in words, and settings with which the controller knows a load or an external load is absent."""
-    own, held, links = controller_prefix(judge), judge.held, judge.setup.links
+    own, held, links = judge.setup.controller, judge.held, judge.setup.links
     if known := {name: value for name, value in links.items() if name.partition("[")[0] == subject}:
         return "with that of the model", known
     if subject == "payload":

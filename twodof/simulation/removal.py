@@ -94,7 +94,7 @@ class _Trials:
     def _run(self, plans: Sequence[Repetition]) -> None:
         """Run plans that have no result yet."""
         new = [plan for plan in plans if plan not in self._results and plan not in self._reasons]
-        for plan, result in zip(new, self._repeat(new)):
+        for plan, result in zip(new, self._repeat([plan.of(self._judge.setup.own) for plan in new])):
             if isinstance(result, str):
                 self._reasons[plan] = result
             elif isfinite(self._size(result)):

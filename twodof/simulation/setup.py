@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fmu import Fmu
+from ..fmu import Fmu, System
+from ..fmu.description import RECORDED
+from ..fmu.wiring import Node
 from ..plant.urdf import INERTIA, UNBOUNDED, RobotError, Urdf, read_urdf
 from ..plant.variables import EXACT, OF_LINKS, name_of_link
 
@@ -20,9 +22,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 OF_THE_CONTROLLER = (
-    "control_period", "control_delay", "q_resolution", "q_noise", "v_noise", "v_from_q", "seed", "payload_known"
+    "control_period", "control_delay", "q_resolution", "q_noise", "v_noise", "v_from_q", "seed"
 )  # fmt: skip
-"""Parameters that plant and controller of a system both have, and that act in the controller."""
+"""Parameters that plant and controller of a system both have, but that act in the controller."""
 
 
 class Limits(NamedTuple):
@@ -43,7 +45,9 @@ class Setup(NamedTuple):
         robot: the robot; None if unknown.
         frame, axes: the end effector's link, and the task axes, letters of "xyz"; "" if unknown.
         step: communication step, s.
-        starts: start values of all inputs and parameters.
+        starts: start values of all inputs and parameters; those of a system's controller also without its name.
+        controller: prefix of the variables of a system's controller, such as "controller."; "" without one.
+        own: names without this prefix, by full name, of variables that only the controller has.
         links: inertial values of links that are inputs, as the controller's model has them.
         unjudged: reasons for which targets are not judged, a line each.
     """
@@ -58,6 +62,8 @@ class Setup(NamedTuple):
     axes: str
     step: float
     starts: Mapping[str, float]
+    controller: str = ""
+    own: Mapping[str, str] = MappingProxyType({})
     links: Mapping[str, float] = MappingProxyType({})
     unjudged: tuple[str, ...] = ()
 
@@ -115,7 +121,14 @@ def robot_of(text: str | None) -> Urdf | None:
 
 
 def setup(
-    *, joints: Sequence[str], robot: Urdf | None, frame: str, axes: str, step: float, starts: Mapping[str, float]
+    *,
+    joints: Sequence[str],
+    robot: Urdf | None,
+    frame: str,
+    axes: str,
+    step: float,
+    starts: Mapping[str, float],
+    controller: str = "",
 ) -> Setup:
     """Return the setup of a run from the facts in its FMU or in its bag's provenance."""
     known = robot.joints if robot is not None else {}
@@ -128,23 +141,55 @@ def setup(
         ends.append(np.array([sign * inf if x is None or abs(x) >= UNBOUNDED else float(x) for x in held]))
     units = tuple("" if joint is None else "m" if joint.prismatic else "rad" for joint in own)
     names = tuple(joints)
-    return Setup(names, units, ends[0], ends[1], limits_of(robot, names), robot, frame, axes, step, _whole(starts))
+    prefix = f"{controller}." if controller else ""
+    alone = {name: short for name in starts if (short := _short(name, prefix)) and short not in starts}
+    starts, bounds = _whole(starts, prefix, alone), limits_of(robot, names)
+    return Setup(names, units, ends[0], ends[1], bounds, robot, frame, axes, step, starts, prefix, alone)
 
 
-def _whole(starts: Mapping[str, float]) -> Mapping[str, float]:
+def controller_of(system: System) -> str:
+    """Return the component that computes the efforts of a system's robot by a control law of this package, or "".
+
+    Other components may be between the controller and the robot.
+    """
+    robot = system.recorded
+    found, seen = {link.source.element for link in system.links if _is_effort(link.target, robot)}, {robot}
+    while found := found & system.components.keys() - seen:
+        if laws := [
+            name for name in found if {"payload_known", "tau_cmd[1]"} <= system.components[name].variables.keys()
+        ]:
+            return laws[0] if len(laws) == 1 else ""
+        seen |= found
+        found = {link.source.element for link in system.links if link.target.element in found}
+    return ""
+
+
+def _is_effort(node: Node, robot: str) -> bool:
+    return node.element == robot and node.connector.partition("[")[0] == "tau_cmd"
+
+
+def _short(name: str, prefix: str) -> str:
+    """Return the name without a prefix of a variable that can describe a controller; "" for other variables."""
+    short = name.removeprefix(prefix)
+    return short if prefix and short != name and short.partition("[")[0] not in RECORDED else ""
+
+
+def _whole(starts: Mapping[str, float], prefix: str, own: Mapping[str, str]) -> Mapping[str, float]:
     """Return a system's start values, with its controller's values of parameters that act in the controller."""
-    parts = [name.removesuffix("control_period") for name in starts if name.endswith(".control_period")]
-    if len(parts) != 1:
+    if not prefix:
         return starts
-    own = {name.removeprefix(parts[0]): value for name, value in starts.items() if name.startswith(parts[0])}
-    period = max(starts.get("control_period", 0.0), own["control_period"])  # the plant may sample its effort, too
-    own = {name: value for name, value in own.items() if name.partition("[")[0] in OF_THE_CONTROLLER}
-    return {**starts, **own, "control_period": period}
+    acting = {name.removeprefix(prefix): value for name, value in starts.items() if name.startswith(prefix)}
+    acting = {name: value for name, value in acting.items() if name.partition("[")[0] in OF_THE_CONTROLLER}
+    period = max(each.get("control_period", 0.0) for each in (starts, acting))  # the plant may sample its effort, too
+    return {**starts, **acting, **{own[name]: starts[name] for name in own}, "control_period": period}
 
 
 def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, float]) -> Setup:
     """Return the setup of a run of an FMU with a robot."""
-    found = setup(joints=fmu.joints, robot=robot, frame=fmu.frame, axes="".join(fmu.axes), step=step, starts=starts)
+    controller, axes = controller_of(fmu) if isinstance(fmu, System) else "", "".join(fmu.axes)
+    found = setup(
+        joints=fmu.joints, robot=robot, frame=fmu.frame, axes=axes, step=step, starts=starts, controller=controller
+    )
     units = tuple(own or fmu.variables[name].unit or "" for own, name in zip(found.units, fmu.vector("q")))
     return found._replace(units=units, links=_inertials(fmu, robot), unjudged=fmu.unjudged)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from .aim import moves, unsettled
 from .cause import FLOOR, MOTION, MOVING, SMALL, Cause, point_text
-from .controller_causes import STILL, controller_prefix, payloads
+from .controller_causes import STILL, payloads
 from .judge import AT_LIMIT, Judge
 from .outcome import SUCCESS, errors_at_the_end, missed_outputs
 
@@ -164,7 +164,7 @@ def _remainder(parts: Mapping[str, float]) -> str:
 def _settings(judge: Judge) -> str:
     """Return the settings of the controller that are not 0 in words."""
     texts = []
-    own = controller_prefix(judge)
+    own = judge.setup.controller
     real, model = payloads(judge)
     believed = {f"{own}payload": " kg"} if model not in (0.0, real) else {}
     for name, unit in {**CONTROLLER, **believed, **dict.fromkeys(SWITCHES, "")}.items():
