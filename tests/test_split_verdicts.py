@@ -136,3 +136,10 @@ def test_the_controller_may_drive_the_robot_through_another_fmu(arms: tuple[Path
     path = edited(arms[1], tmp_path / "through.ssp", changes, pd=through)
     line = twodof.simulate(path, settings={"plant.payload": 0.05}).verdict.lines[0]
     assert line.endswith("set controller.payload_known=true and controller.payload=0.05")
+
+
+def test_layouts_of_a_system_need_no_step(
+    arms: tuple[Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert len(twodof.layouts(arms[1], tmp_path)) == 3
+    assert not caplog.records

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from math import inf
 from pathlib import Path
 from string import Template
 
@@ -44,7 +45,7 @@ def layouts(
     """
     check_name("namespace", namespace)
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
-    own = Messages(experiment(fmu, stop_time=1.0, step=1.0), scene=True, effort=bool(fmu.vector("tau"))).topics
+    own = Messages(experiment(fmu, stop_time=inf), scene=True, effort=bool(fmu.vector("tau"))).topics
     prefix = f"/{namespace.strip('/')}" if namespace else ""
     types = {prefix + name: topic.type for name, topic in own.items()}
     units = {
