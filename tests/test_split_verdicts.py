@@ -138,6 +138,16 @@ def test_the_controller_may_drive_the_robot_through_another_fmu(arms: tuple[Path
     assert line.endswith("set controller.payload_known=true and controller.payload=0.05")
 
 
+def test_a_payload_that_the_controller_knows_wrong_is_named(arms: tuple[Path, Path]) -> None:
+    settings: dict[str, Any] = {"plant.payload": 0.1, "controller.payload": 0.2, "controller.payload_known": True}
+    (cause, *_) = twodof.simulate(arms[1], settings=settings).verdict.causes
+    assert cause.text.startswith("the controller assumes a payload of 0.2 kg, the plant has 0.1 kg")
+    assert cause.text.endswith("; set controller.payload=0.1")
+    assert cause.tried.startswith("with that of the plant: ") and cause.tried.endswith("reached")
+    cured = twodof.simulate(arms[1], settings={**settings, "controller.payload": 0.1}).verdict
+    assert cured.outcome == "reached" and not cured.causes
+
+
 def test_layouts_of_a_system_need_no_step(
     arms: tuple[Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -82,9 +82,12 @@ def load(judge: Judge, slight: float = SLIGHT) -> Iterator[Cause]:
     """
     switch, (payload, believed) = "payload_known", payloads(judge)
     own = judge.setup.controller
-    if payload and believed != payload and (share := _share(judge, payload * GRAVITY * LEVER)) > slight:
-        remedy = f"set {own}{switch}=true" + f" and {own}payload={payload:g}" * bool(own)
-        text = f"the controller does not know the payload of {payload:g} kg; {remedy}"
+    if payload and believed != payload and (share := _share(judge, abs(payload - believed) * GRAVITY * LEVER)) > slight:
+        text = f"the controller does not know the payload of {payload:g} kg; set {own}{switch}=true"
+        text += f" and {own}payload={payload:g}" * bool(own)
+        if believed:
+            text = f"the controller assumes a payload of {believed:g} kg, the plant has {payload:g} kg"
+            text += f"; set {own}payload={payload:g}"
         yield Cause("load", text, share, subject="payload")
     elif believed and not payload:
         text = f"the controller assumes a payload of {believed:g} kg, which the plant does not have; set {own}payload=0"

@@ -95,9 +95,11 @@ def _known_load(judge: Judge, subject: str) -> tuple[str, dict[str, float]]:
     if known := {name: value for name, value in links.items() if name.partition("[")[0] == subject}:
         return "with that of the model", known
     if subject == "payload":
-        payload, _ = payloads(judge)
+        payload, believed = payloads(judge)
+        if own and not payload:
+            return "without it", {f"{own}payload": 0.0}
         known = {f"{own}payload_known": True, f"{own}payload": payload}
-        return ("if it is known", known) if payload or not own else ("without it", {f"{own}payload": 0.0})
+        return "with that of the plant" if believed else "if it is known", known
     if own and f"{own}{subject}[1]" in held:
         model = [name for name in held if name.partition("[")[0] == subject]
         return "with that of the plant", {f"{own}{name}": held[name] for name in model}
