@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 from systems import component, connection, pd_fmu
 
 import twodof
+from twodof.cli.main import main
 from twodof.fmu.ssp_file import STRUCTURE
 
 PERIOD = {"control_period": 0.01}
@@ -136,6 +139,37 @@ def test_the_controller_may_drive_the_robot_through_another_fmu(arms: tuple[Path
     path = edited(arms[1], tmp_path / "through.ssp", changes, pd=through)
     line = twodof.simulate(path, settings={"plant.payload": 0.05}).verdict.lines[0]
     assert line.endswith("set controller.payload_known=true and controller.payload=0.05")
+
+
+WIRED = re.compile(r"<ssd:Connection .*?(?:/>|</ssd:Connection>)", re.DOTALL)
+
+
+def rewired(ssp: Path, path: Path, change: Callable[[str], str]) -> Path:
+    """Write a system with another text of each connection."""
+    with zipfile.ZipFile(ssp) as arm:
+        wires = WIRED.findall(arm.read(STRUCTURE).decode())
+    return edited(ssp, path, {wire: change(wire) for wire in wires})
+
+
+@pytest.mark.parametrize("missing", ["controller.q", "controller.v", "plant.tau_cmd"])
+def test_a_vector_without_a_connection_is_named(
+    arms: tuple[Path, Path], missing: str, tmp_path: Path, caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Unless a setting or an input over time gives it."""
+    twodof.experiment(arms[1])
+    assert not caplog.records
+    element, _, group = missing.partition(".")
+    ends = f'endElement="{element}" endConnector="{group}['
+    path = rewired(arms[1], tmp_path / "part.ssp", lambda wire: "" if ends in wire else wire)
+    twodof.experiment(path)
+    line = f"the input {missing} is not connected, and keeps its value"
+    assert [record.getMessage() for record in caplog.records] == [f"'{path}': {line}"]
+    assert main(["info", str(path)]) == 0 and line in capsys.readouterr().out
+    caplog.clear()
+    twodof.experiment(path, settings={missing: (0.1, 0.0)})
+    twodof.experiment(path, changes=[(0.5, {missing: (0.1, 0.0)})])
+    assert not caplog.records
 
 
 def test_a_payload_that_the_controller_knows_wrong_is_named(arms: tuple[Path, Path]) -> None:

@@ -186,14 +186,17 @@ def _print_head(fmu: Fmu) -> None:
 
 
 def _print_system(system: System) -> None:
+    from ..simulation.setup import unconnected
+
     robot, parts = system.recorded, system.components.items()
+    remarks = [*system.remarks(), *unconnected(system), *system.unjudged]
     print_table(
         ("system", f"{system.path} ({system.name})"),
         ("digest", system.guid),
         ("robot", f"{robot}: {', '.join(system.joints)}"),
         *(("" if i else "FMUs", f"{name}: {_origin(fmu)}, FMI {fmu.version}.0") for i, (name, fmu) in enumerate(parts)),
         *(("" if i else "connections", text) for i, text in enumerate(system.connections or ["none"])),
-        *(("" if i else "remarks", text) for i, text in enumerate([*system.remarks(), *system.unjudged])),
+        *(("" if i else "remarks", text) for i, text in enumerate(remarks)),
     )
 
 

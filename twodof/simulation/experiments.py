@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import inf, isfinite
 from numbers import Real
 from pathlib import Path
@@ -17,8 +17,9 @@ from typing import TypedDict
 
 from ..bounds import MIN_STEP
 from ..errors import InputError
-from ..fmu import Fmu, load_fmu
+from ..fmu import Fmu, System, load_fmu
 from .input_values import Changes, Setting, Value, read_changes, resolve, resolve_all
+from .setup import unconnected
 
 TIME_TOLERANCE = 1e-9  # fraction of a communication step
 NANOSECONDS = 1_000_000_000
@@ -146,7 +147,8 @@ def experiment(
         stamp_start=stamp_start,
         signals=fmu.real_outputs if signals else (),
     )
-    for line in fmu.remarks(settings or ()):
+    loose = unconnected(fmu, chain(given, *(inputs for _, inputs in due))) if isinstance(fmu, System) else []
+    for line in [*fmu.remarks(settings or ()), *loose]:
         LOG.warning(f"'{fmu.path}': {line}")
     run.first_stamp()  # raises for a time that ROS 2 cannot express
     _report_late(run, "`changes`" if input_file is None else f"'{input_file}'")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
@@ -162,6 +162,23 @@ def controller_of(system: System) -> str:
         seen |= found
         found = {link.source.element for link in system.links if link.target.element in found}
     return ""
+
+
+def unconnected(system: System, given: Iterable[str] = ()) -> list[str]:
+    """Return a line for each input vector between plants and controllers of which no element is connected or given.
+
+    Controllers have inputs q and v and an output tau_cmd; in a system with one, each input tau_cmd is of a plant.
+    """
+    known = {link.target for link in system.links} | {system.nodes[name] for name in given}
+    laws = [name for name, fmu in system.components.items() if "tau_cmd" in fmu.groups("output")]
+    having = [(name, group) for name in laws for group in "qv"]
+    having += [(name, "tau_cmd") for name in system.components if laws]
+    lines = []
+    for name, group in having:
+        nodes = {Node(name, own) for own in system.components[name].groups("input").get(group, ())}
+        if nodes and nodes.isdisjoint(known):
+            lines.append(f"the input {name}.{group} is not connected, and keeps its value")
+    return lines
 
 
 def _is_effort(node: Node, robot: str) -> bool:
