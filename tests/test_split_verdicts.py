@@ -172,6 +172,32 @@ def test_a_vector_without_a_connection_is_named(
     assert not caplog.records
 
 
+def test_info_prints_the_order_of_crossed_elements(
+    arms: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def crossed(wire: str) -> str:
+        swap = {"1": "2", "2": "1"}
+        return re.sub(r'(endConnector="(?:q|tau_cmd)\[)(\d)', lambda found: found[1] + swap[found[2]], wire)
+
+    path = tmp_path / "crossed.ssp"
+    with zipfile.ZipFile(arms[1]) as arm:
+        text = arm.read(STRUCTURE).decode()
+    begin, end = text.index("<ssd:Connections>"), text.index("</ssd:Connections>")
+    edited(arms[1], path, {text[begin:end]: crossed(text[begin:end])})
+    found = []
+    for each in (arms[1], path):
+        assert main(["info", str(each)]) == 0
+        found.append([line.split("  ")[-1].strip() for line in capsys.readouterr().out.splitlines() if "->" in line])
+    straight, other = found
+    assert straight == [
+        "plant.q -> controller.q, 2 values",
+        "plant.v -> controller.v, 2 values",
+        "controller.tau_cmd -> plant.tau_cmd, 2 values",
+    ]
+    order = ": [1] -> [2], [2] -> [1]"
+    assert other == [straight[0] + order, straight[1], straight[2] + order]
+
+
 def test_a_payload_that_the_controller_knows_wrong_is_named(arms: tuple[Path, Path]) -> None:
     settings: dict[str, Any] = {"plant.payload": 0.1, "controller.payload": 0.2, "controller.payload_known": True}
     (cause, *_) = twodof.simulate(arms[1], settings=settings).verdict.causes

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..simulation.verdict import Verdict
 
 
+MOST_CROSSED = 10  # elements of a connection of vectors
 MOST_JUDGED = 200_000  # samples of up to 10 joints without a stored verdict, which take a second to judge
 
 
@@ -83,7 +84,7 @@ def _print_fmu_json(fmu: Fmu) -> None:
 
     print_json(
         kind="system" if isinstance(fmu, System) else "FMU",
-        **(dict(components=[*fmu.components], connections=fmu.connections) if isinstance(fmu, System) else {}),
+        **(dict(components=[*fmu.components], connections=_connections(fmu)) if isinstance(fmu, System) else {}),
         path=str(fmu.path),
         **{key: getattr(fmu, key) for key in ("name", "guid")},
         tool=fmu.description.generationTool,
@@ -195,9 +196,24 @@ def _print_system(system: System) -> None:
         ("digest", system.guid),
         ("robot", f"{robot}: {', '.join(system.joints)}"),
         *(("" if i else "FMUs", f"{name}: {_origin(fmu)}, FMI {fmu.version}.0") for i, (name, fmu) in enumerate(parts)),
-        *(("" if i else "connections", text) for i, text in enumerate(system.connections or ["none"])),
+        *(("" if i else "connections", text) for i, text in enumerate(_connections(system) or ["none"])),
         *(("" if i else "remarks", text) for i, text in enumerate(remarks)),
     )
+
+
+def _connections(system: System) -> list[str]:
+    """Return the texts of the connections, with the elements of vectors whose indices differ."""
+    crossed: dict[tuple[object, ...], list[str]] = {}
+    for source, target, affine in system.links:
+        (start, _, i), (end, _, j) = (str(node).partition("[") for node in (source, target))
+        elements = crossed.setdefault((start, end, affine), [])
+        if i and j and i != j:
+            elements.append(f"[{i} -> [{j}")
+    more = [
+        ", ".join(each[:MOST_CROSSED]) + f" and {len(each) - MOST_CROSSED} more" * (len(each) > MOST_CROSSED)
+        for each in crossed.values()
+    ]
+    return [f"{text}: {own}" if own else text for text, own in zip(system.connections, more)]
 
 
 def _origin(fmu: Fmu) -> str:
