@@ -408,6 +408,76 @@ def test_integers_and_truth_values_have_their_start_values(tmp_path: Path) -> No
         assert ("start values" in found) == bool(changed)
 
 
+OMITTED = [
+    ('<Outputs><Unknown index="4"', "1", "y depends on x, and its Output"),
+    ('<Derivatives><Unknown index="3"', "1", "der(x) depends on x, and its Derivative"),
+    ('<Derivatives><Unknown index="3"', "2", "der(x) depends on u, and its Derivative"),
+    ('<InitialUnknowns><Unknown index="3"', "2", "der(x) depends on u, and its InitialUnknown"),
+    ('<InitialUnknowns><Unknown index="3"/><Unknown index="4"', "1", "y depends on x, and its InitialUnknown"),
+    ('<Output valueReference="4"', "1", "y depends on x, and its Output"),
+    ('<ContinuousStateDerivative valueReference="3"', "2", "der(x) depends on u, and its Derivative"),
+    ('<InitialUnknown valueReference="3"', "2", "der(x) depends on u, and its InitialUnknown"),
+]
+
+
+@pytest.mark.parametrize(("unknown", "known", "text"), OMITTED)
+def test_a_dependency_that_derivatives_show_must_be_declared(
+    unknown: str, known: str, text: str, tmp_path: Path
+) -> None:
+    """ẋ = u − x, and y = x + 2 u."""
+    described = DESCRIPTION_3 if "valueReference" in unknown else DESCRIPTION
+    for dependencies in (known, "1 2"):
+        changed = described.replace(unknown, f'{unknown} dependencies="{dependencies}"', 1)
+        assert changed != described
+        found = failed(twodof.check(foreign(tmp_path, description=changed)))
+        assert found == ({} if dependencies == "1 2" else {"derivatives": f"{text} does not declare it"})
+
+
+@pytest.mark.parametrize("kind", ["constant", "fixed", "dependent"])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_constant_dependency_has_one_derivative(kind: str, fmi: Any, tmp_path: Path, native_path: Path) -> None:
+    """x = cos q₁ + … is nonlinear, and y = x + 2 u linear."""
+    described = DESCRIPTION if fmi == 2 else DESCRIPTION_3
+    linear = '<Outputs><Unknown index="4"' if fmi == 2 else '<Output valueReference="4"'
+    stated = f'{linear} dependencies="1 2" dependenciesKind="{kind} {kind}"'
+    assert not failed(twodof.check(foreign(tmp_path, description=described.replace(linear, stated))))
+    path, files = arm(tmp_path, fmi, native_path)
+    text = files["modelDescription.xml"].decode()
+    kinds = rf'\1 dependenciesKind="{kind} {kind}"'
+    changed = re.sub(r'((?:<Unknown index|<Output valueReference)="\d+" dependencies="\d+ \d+")', kinds, text, count=1)
+    assert changed != text
+    path.write_bytes(zipped({**files, "modelDescription.xml": changed.encode()}))
+    found = failed(twodof.check(path))
+    assert {*found} == (set() if kind == "dependent" else {"derivatives"}), found
+    assert kind == "dependent" or found["derivatives"].endswith(f"and its dependency is declared as {kind}"), found
+
+
+def arm(folder: Path, fmi: Any, native_path: Path) -> tuple[Path, dict[str, bytes]]:
+    """Return the path of a native arm to be changed, and the files of the arm with scalar variables."""
+    path = folder / "arm.fmu"
+    options = twodof.FmuOptions(native=True, fmi=3, arrays=False)
+    built = twodof.build_fmu(path, options) if fmi == 3 else native_path
+    with zipfile.ZipFile(built) as archive:
+        return path, {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("states", ["q", "v"])
+def test_exchanged_derivatives_of_states_fail(states: str, fmi: Any, tmp_path: Path, native_path: Path) -> None:
+    path, files = arm(tmp_path, fmi, native_path)
+    text = files["modelDescription.xml"].decode()
+    places = {}
+    for name in (f"{states}[1]", f"{states}[2]"):
+        found = re.search(rf'name="der\({re.escape(name)}\)".*?derivative="(\d+)"', text, re.DOTALL)
+        assert found
+        places[found[1]] = found.span(1)
+    (one, (low, high)), (two, (start, end)) = places.items()
+    text = f"{text[:low]}{two}{text[high:start]}{one}{text[end:]}"
+    path.write_bytes(zipped({**files, "modelDescription.xml": text.encode()}))
+    texts = failed(twodof.check(path))
+    assert {*texts} == {"derivatives"} and "stated as the derivative of" in texts["derivatives"], texts
+
+
 def with_zeros(description: str, variability: str) -> str:
     """Return a description with parameters that start at 0."""
     zeros = ZEROS.replace('"fixed"', f'"{variability}"', 1)

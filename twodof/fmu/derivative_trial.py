@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from .instance import Instance
-from .trial import DELTA, Trial, UnpassedError
+from .trial import DELTA, Trial, UnpassedError, dependencies, undeclared
 
 PART = 0.37  # fraction of a step, after which a sampled controller takes no sample
 MOST_KNOWNS = 200  # inputs and states with respect to which derivatives are compared
@@ -23,6 +23,12 @@ of rounding.
 NEAR, SCATTER = (0.9, 0.9137, 0.9291, 0.9473, 0.9649, 0.9831), 4.0
 """If a derivative differs from the quotients, quotients of these fractions of the width are taken too. They differ by
 the rounding of terms within the FMU, which no output shows, and SCATTER times their spread is added to the tolerance.
+"""
+STEADY, CHANGED = ("constant", "fixed", "tunable"), 1e-4
+"""Kinds of dependencies whose derivatives do not change in a run, and the smallest relative change that is judged."""
+OWN, OTHER = 0.2, 0.03
+"""Relative difference of a state's change from the integral of its derivative, above which that may be another state's
+derivative, and the difference from the integral of the other one, below which it is.
 """
 ULPS = 32.0  # spacings of numbers by which an output may be rounded, at the magnitude of its terms or its nominal value
 Array = NDArray[np.float64]
@@ -54,6 +60,8 @@ class Point:
 
     Attributes:
         values: the point, by the names of the knowns.
+        rates: names of derivatives of states.
+        unknowns: names of real outputs and of derivatives of states.
         sizes: magnitudes of the unknowns, at least their nominal values, which are 1 if not stated.
     """
 
@@ -61,13 +69,14 @@ class Point:
         self._trial = trial
         rates = [unknown.variable for unknown in trial.about.derivatives]
         states = [v.derivative for v in rates if v.derivative is not None]
+        self.rates = [name for name, v in trial.variables.items() if v in rates]
         settable = [state for state in states if state.initial in ("exact", "approx")]
         names = [*trial.inputs, *(name for name, v in trial.variables.items() if v in settable)]
         starts = {name: trial.fmu.variables[name].start_value for name in names}
         widths = {name: DELTA * max(1.0, abs(start)) for name, start in starts.items() if start is not None}
         self._widths = dict([*widths.items()][:MOST_KNOWNS])
         self.values = {name: trial.inside(name, 2.0 * width) for name, width in self._widths.items()}
-        self.unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
+        self.unknowns = [*trial.outputs, *self.rates]
         nominals = (float(trial.variables[name].nominal or 1.0) for name in self.unknowns)
         self.sizes = np.array([abs(size) if size and isfinite(size) else 1.0 for size in nominals])
 
@@ -75,6 +84,10 @@ class Point:
         """Set the magnitudes of the unknowns at least to those of the terms of which they consist."""
         terms = np.abs(stated) @ [max(1.0, abs(value)) for value in self.values.values()]
         self.sizes = np.fmax(self.sizes, np.where(np.isfinite(terms), terms, 0.0))
+
+    def least(self, name: str) -> Array:
+        """Return the smallest derivatives over a variable that rounding does not explain."""
+        return EXACT * self.sizes / max(1.0, abs(self.values[name]))
 
     def keep_inside(self, instance: Instance) -> None:
         """Move states that a parameter bounds below their start values, and leave out those that cannot change."""
@@ -166,12 +179,80 @@ def _check_sum(instance: Instance, point: Point, stated: Array) -> None:
         raise SimulationError(f"{what} is {found[k]:.9g}, and the sum of those with one seed each is {total[k]:.9g}")
 
 
-def _check_later(trial: Trial, instance: Instance, point: Point) -> None:
+def _check_declared(trial: Trial, point: Point, name: str, clear: NDArray[np.bool_]) -> None:
+    """Raise for an unknown that clearly depends on a variable and does not declare it.
+
+    The trial of inputs judges outputs that depend on inputs.
+    """
+    own, about = trial.fmu.variables[name].reference, trial.about
+    kinds = {"Output": about.outputs, "Derivative": about.derivatives}
+    if name in trial.inputs or trial.variables[name].initial == "exact":
+        kinds["InitialUnknown"] = about.initialUnknowns
+    for kind, unknowns in kinds.items():
+        declared = dependencies(unknowns)
+        for unknown in (u for u, depends in zip(point.unknowns, clear) if depends):
+            judged = name in trial.inputs and unknown in trial.outputs
+            if not judged and own not in declared.get(trial.fmu.variables[unknown].reference, {own}):
+                raise undeclared(unknown, name, kind)
+
+
+def _check_kinds(trial: Trial, instance: Instance, point: Point, stated: Array) -> None:
+    """Compare derivatives after the steps with those at the start, where the kind of a dependency keeps them."""
+    steady = {
+        (unknown.variable.valueReference, known.valueReference): kind
+        for unknown in [*trial.about.outputs, *trial.about.derivatives]
+        for known, kind in zip(unknown.dependencies or (), unknown.dependenciesKind or ())
+        if kind in STEADY
+    }
+    variables = trial.fmu.variables
+    for start, name in zip(stated.T, point.values):
+        kinds = [steady.get((variables[u].reference, variables[name].reference)) for u in point.unknowns]
+        if not any(kinds):
+            continue
+        later = instance.derivatives(point.unknowns, [name])[:, 0]
+        changed = np.abs(later - start) > CHANGED * np.maximum(np.abs(later), np.abs(start)) + point.least(name)
+        for unknown, kind, old, new, differs in zip(point.unknowns, kinds, start, later, changed):
+            if kind and differs:
+                what = f"∂{unknown}/∂{name} is {old:.9g} at the start and {new:.9g} after the steps"
+                raise SimulationError(f"{what}, and its dependency is declared as {kind}")
+
+
+def _check_rates(trial: Trial, instance: Instance, point: Point) -> None:
+    """Raise if derivatives are those of other states, by the changes of states in the steps."""
+    variables = trial.fmu.variables
+    found = {(v.reference, v.element): name for name, v in variables.items() if v.type == "Real"}
+    rates = [name for name in point.rates if trial.variables[name].derivative is not None][:MOST_KNOWNS]
+    of = [(trial.variables[name].derivative.valueReference, variables[name].element) for name in rates]
+    if len(rates) < 2 or not {*of} <= {*found}:
+        return
+    states = [found[place] for place in of]
+    read = instance.reader([*rates, *states])
+    trial.begin_again(instance, point.values)
+    rows = [np.array(read())]
+    for k in range(trial.steps):
+        trial.note(f"step {k + 1}")
+        instance.step(trial.start + k * trial.step, trial.step)
+        rows.append(np.array(read()))
+    slopes, values = np.split(np.array(rows), 2, axis=1)
+    changes, integrals = np.diff(values, axis=0), trial.step * 0.5 * (slopes[1:] + slopes[:-1])
+    sizes = np.linalg.norm(changes, axis=0)
+    moved = sizes > EXACT * np.maximum(1.0, np.abs(values).max(axis=0))
+    away = np.linalg.norm(changes[:, :, None] - integrals[:, None, :], axis=0) / np.where(moved, sizes, np.inf)[:, None]
+    strange = moved & (np.diag(away) > OWN)
+    for k in map(int, np.flatnonzero(strange)):
+        j = int(away[k].argmin())
+        if strange[j] and away[k, j] < OTHER:
+            what = f"{states[k]} changes by {rates[j]}"
+            raise SimulationError(f"{what}, which is stated as the derivative of {states[j]}")
+
+
+def _check_later(trial: Trial, instance: Instance, point: Point, stated: Array) -> None:
     """Compare derivatives over inputs after the steps; outputs that change only in a step are not compared."""
     names = [name for name in point.values if name in trial.inputs]
     steps = trial.steps - 1
     trial.begin_again(instance, point.values)
     point.go_on(instance, steps)
+    _check_kinds(trial, instance, point, stated)
     for given, name in zip(_given(trial, instance, point, names).T, names):
         slopes = point.slopes(instance, name, instance.set, given)
         instance.set({name: point.values[name]})
@@ -221,7 +302,10 @@ def derivatives(trial: Trial) -> str:
                 if name in trial.inputs or not samples:
                     raise SimulationError(text)
                 doubtful = doubtful or text
-        _check_later(trial, instance, point)
+            clear = slopes.smooth & ~slopes.differ(given) & (np.abs(given) > slopes.doubt + point.least(name))
+            _check_declared(trial, point, name, clear)
+        _check_later(trial, instance, point, stated)
+        _check_rates(trial, instance, point)
     if doubtful:
         raise UnpassedError("remark", f"{doubtful}; the first may contain a sample that the initialisation takes")
     if stated.size == jumps:

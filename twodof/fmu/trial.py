@@ -8,7 +8,7 @@ from functools import cached_property
 from math import inf, isfinite
 from typing import Any
 
-from fmpy.model_description import ModelVariable
+from fmpy.model_description import ModelVariable, Unknown
 
 from ..errors import SimulationError
 from ..export.typed_values import DISCRETE
@@ -228,3 +228,18 @@ class Trial:
         low, high = (end if text is None else float(text) for text, end in ((variable.min, -inf), (variable.max, inf)))
         margin = change if high - low > 2.0 * change else 0.0
         return min(max(start + change, low + margin), high - margin)
+
+
+def dependencies(unknowns: Sequence[Unknown]) -> dict[int, set[int]]:
+    """Return the value references on which unknowns depend, by that of the unknown, if they state them."""
+    found: dict[int, set[int]] = {}
+    for unknown in unknowns:
+        if unknown.dependencies is not None:
+            references = (variable.valueReference for variable in unknown.dependencies)
+            found.setdefault(unknown.variable.valueReference, set()).update(references)
+    return found
+
+
+def undeclared(unknown: str, known: str, kind: str) -> SimulationError:
+    """Return the error of a dependency that an element of a ``kind`` of the model structure does not declare."""
+    return SimulationError(f"{unknown} depends on {known}, and its {kind} does not declare it")

@@ -14,15 +14,13 @@ from functools import partial
 from itertools import accumulate
 from math import inf, isfinite
 
-from fmpy.model_description import Unknown
-
 from ..errors import SimulationError
 from .derivative_trial import derivatives
 from .importers import READ_AT_START, TOOLS, Run, in_this_master
 from .instance import Instance
 from .reference_runs import Reference
 from .system_instance import instantiate_fmu
-from .trial import Outputs, Trial, UnpassedError, Values
+from .trial import Outputs, Trial, UnpassedError, Values, dependencies, undeclared
 
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
 """Sizes of variable steps, as multiples of the default step."""
@@ -226,7 +224,7 @@ def inputs(trial: Trial) -> str:
     changes: Values = {**trial.changed_inputs(), **others}
     if not changes:
         raise UnpassedError("does not apply", "it has no inputs that can be changed")
-    initial, later = _stated(trial.about.initialUnknowns), _stated(trial.about.outputs)
+    initial, later = dependencies(trial.about.initialUnknowns), dependencies(trial.about.outputs)
     with trial.instance() as instance:
         read = trial.reader(instance)
         start = read()
@@ -243,16 +241,6 @@ def inputs(trial: Trial) -> str:
     return f"{len(changes)} inputs; outputs depend only on those that they declare"
 
 
-def _stated(unknowns: Sequence[Unknown]) -> dict[int, set[int]]:
-    """Return the value references on which unknowns depend, if they state them."""
-    stated: dict[int, set[int]] = {}
-    for unknown in unknowns:
-        if unknown.dependencies is not None:
-            references = (variable.valueReference for variable in unknown.dependencies)
-            stated.setdefault(unknown.variable.valueReference, set()).update(references)
-    return stated
-
-
 def _compare_dependencies(
     trial: Trial, name: str, before: Outputs, after: Outputs, stated: Mapping[int, set[int]], kind: str
 ) -> None:
@@ -260,7 +248,7 @@ def _compare_dependencies(
     own = trial.fmu.variables[name].reference
     for output, old, new in zip(trial.names, before, after):
         if old != new and own not in stated.get(trial.fmu.variables[output].reference, {own}):
-            raise SimulationError(f"{output} depends on {name}, and its {kind} does not declare it")
+            raise undeclared(output, name, kind)
 
 
 def call_order(trial: Trial) -> str:
